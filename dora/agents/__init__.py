@@ -1,1 +1,4 @@
-"""Package."""
+"""TorchRL learners: environments, collectors, PPO, SAC, evaluation, logging and checkpoints.
+
+Nothing here imports ManiSkill or SAPIEN: a task is whatever follows `dora.agents.env.Task`.
+"""

@@ -1,1 +1,15 @@
-"""Package."""
+"""What ManiSkill lacks: many environments in one process on a CPU, contact reading, and time measurement.
+
+Importing this package makes ``sim_backend="physx_cpu_batch"`` known to ManiSkill, for every task:
+
+    import dora.sim
+    env = gymnasium.make("PickCube-v1", num_envs=32, sim_backend="physx_cpu_batch")
+"""
+
+from dora.sim.batch.hooks import BACKEND, install, runs_batched
+from dora.sim.profile import StepProfile
+from dora.sim.rendering import can_render
+
+install()
+
+__all__ = ["BACKEND", "StepProfile", "can_render", "install", "runs_batched"]

@@ -1,0 +1,164 @@
+"""Rollouts by TorchRL collectors, in this process or in worker processes that each hold a task batch."""
+
+import functools
+import os
+import signal
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector, MultiSyncCollector
+
+from dora.agents.env import Task, TaskEnv, TaskFactory
+from dora.agents.networks import Policy
+from dora.errors import InputError
+
+SHUTDOWN_SECONDS = 10.0  # workers that have not ended by then are killed
+
+
+class WorkerTaskEnv(TaskEnv):
+    """`TaskEnv` of a worker process: leaves the message of an exception in a file for the main process.
+
+    TorchRL itself tells the main process only that a worker ended.
+    """
+
+    def __init__(self, task: Task, report: Path, *, seed: int, stagger: bool):
+        self.report = report
+        super().__init__(task, seed=seed, stagger=stagger)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        with _reported(self.report):
+            return super()._step(tensordict)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        with _reported(self.report):
+            return super()._reset(tensordict, **kwargs)
+
+
+@contextmanager
+def _reported(report: Path) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        kind = "InputError" if isinstance(error, InputError) else type(error).__name__
+        report.write_text(f"{kind}\n{error}")
+        raise
+
+
+def _make_worker_env(make_task: TaskFactory, report: Path, seed: int, stagger: bool) -> WorkerTaskEnv:
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)
+    with _reported(report):
+        return WorkerTaskEnv(make_task(), report, seed=seed, stagger=stagger)
+
+
+class Rollouts:
+    """Endless source of batches (workers * num_envs, rollout) of transitions of a policy.
+
+    Args:
+        make_task: makes one task batch; called once in each worker.
+        policy: acts; the workers use copies, which `push` brings up to date.
+        workers: worker processes, or 0 to collect in this process.
+        rollout: control steps per environment and batch.
+        seeds: one per worker (one if `workers` is 0), for its tasks and its exploration.
+        stagger: see `TaskEnv`.
+    """
+
+    def __init__(
+        self,
+        make_task: TaskFactory,
+        policy: Policy,
+        *,
+        workers: int,
+        num_envs: int,
+        rollout: int,
+        seeds: Sequence[int],
+        stagger: bool,
+    ):
+        self._scratch = tempfile.TemporaryDirectory(prefix="dora-workers-")
+        self._reports = [Path(self._scratch.name) / str(i) for i in range(max(workers, 1))]
+        if workers == 0:
+            env = TaskEnv(make_task(), seed=seeds[0], stagger=stagger)
+            self._collector = Collector(
+                env,
+                policy,
+                frames_per_batch=num_envs * rollout,
+                total_frames=-1,
+                trust_policy=True,
+                auto_register_policy_transforms=False,
+            )
+        else:
+            factories = [
+                functools.partial(_make_worker_env, make_task, report, seed, stagger)
+                for report, seed in zip(self._reports, seeds, strict=True)
+            ]
+            with _sigint_blocked(), self._explained():
+                self._collector = MultiSyncCollector(
+                    factories,
+                    policy,
+                    frames_per_batch=workers * num_envs * rollout,
+                    total_frames=-1,
+                    cat_results=0,
+                    use_buffers=True,
+                    num_threads=os.cpu_count(),
+                    num_sub_threads=1,
+                    trust_policy=True,
+                    auto_register_policy_transforms=False,
+                )
+        self._iterator = iter(self._collector)
+
+    def collect(self) -> TensorDictBase:
+        """The next batch; its memory is reused by the following call.
+
+        Raises:
+            InputError: with the message of a worker that raised one.
+            RuntimeError: if a worker failed otherwise.
+        """
+        with self._explained():
+            return next(self._iterator)
+
+    def push(self) -> None:
+        """Give the workers the present weights and normaliser of the policy."""
+        if isinstance(self._collector, MultiSyncCollector):
+            self._collector.update_policy_weights_()
+
+    def close(self) -> None:
+        """End the workers."""
+        self._collector.shutdown(timeout=SHUTDOWN_SECONDS)
+        self._scratch.cleanup()
+
+    def __enter__(self) -> "Rollouts":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Replace TorchRL's "a process failed" by what the worker said."""
+        try:
+            yield
+        except Exception as error:
+            for index, report in enumerate(self._reports):
+                if report.exists():
+                    kind, _, message = report.read_text().partition("\n")
+                    if kind == "InputError":
+                        raise InputError(message) from None
+                    raise RuntimeError(f"worker {index} failed with {kind}: {message}") from error
+            raise
+
+
+@contextmanager
+def _sigint_blocked() -> Iterator[None]:
+    """Block Ctrl-C while workers start: they keep the mask for good, this process gets the signal later."""
+    resource_tracker.ensure_running()  # unblocks SIGINT itself when it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

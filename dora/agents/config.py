@@ -1,0 +1,144 @@
+"""Settings of a run: what `config.yaml` holds, and their digest."""
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+AGENTS = ("ppo", "sac", "mappo", "happo")
+SINGLE_ARM_AGENTS = ("ppo", "sac")
+GUIDANCES = ("affordance", "none")
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimisation (Schulman et al. 2017) with an adaptive learning rate."""
+
+    rollout: int = 32
+    """Control steps per environment and iteration."""
+    epochs: int = 4
+    """Passes over each batch."""
+    minibatch: int = 512
+    """Transitions per gradient step."""
+    gamma: float = 0.98
+    """Discount per control step."""
+    gae_lambda: float = 0.95
+    """Decay of the generalised advantage estimate."""
+    clip: float = 0.2
+    """Half width of the trust interval of the probability ratio."""
+    entropy: float = 1e-3
+    """Weight of the entropy bonus."""
+    value: float = 0.1
+    """Weight of the value loss."""
+    bound: float = 5e-3
+    """Weight of the penalty on mean actions outside [-1, 1]."""
+    grad_norm: float = 1.0
+    """Gradients are scaled down to this norm."""
+    learning_rate: float = 5e-4
+    """First learning rate of Adam."""
+    learning_rate_min: float = 1e-4
+    """Smallest learning rate that the adaptation chooses."""
+    learning_rate_max: float = 1e-3
+    """Largest learning rate that the adaptation chooses."""
+    target_kl: float = 0.015
+    """Divergence of successive policies, nats, at which the learning rate is kept."""
+    log_std: float = -0.7
+    """First logarithm of the exploration noise, in units of the action range's half width."""
+    log_std_min: float = -3.0
+    """Smallest logarithm of the exploration noise."""
+    noise_correlation: float = 0.0
+    """Correlation of the exploration noise of successive steps, in [0, 1)."""
+    hidden: tuple[int, ...] = (256, 128)
+    """Widths of the hidden layers of actor and critic."""
+
+
+@dataclass(frozen=True)
+class SACConfig:
+    """Soft actor-critic (Haarnoja et al. 2018) with layer-normalised critics and learned temperature."""
+
+    rollout: int = 8
+    """Control steps per environment and iteration."""
+    batch: int = 512
+    """Transitions per gradient step."""
+    updates_per_step: float = 1 / 32
+    """Gradient steps per environment step."""
+    warmup: int = 4000
+    """Environment steps before the first gradient step."""
+    capacity: int = 400_000
+    """Transitions in the replay buffer."""
+    gamma: float = 0.97
+    """Discount per control step."""
+    learning_rate: float = 6e-4
+    """Learning rate of actor and critics."""
+    learning_rate_alpha: float = 1e-3
+    """Learning rate of the temperature."""
+    alpha: float = 0.05
+    """First temperature, in units of reward per nat."""
+    target_entropy: float = -0.5
+    """Target entropy of the policy, nats per action dimension."""
+    polyak: float = 0.01
+    """Share by which the target critics follow the critics at each gradient step."""
+    log_std: float = -0.5
+    """First logarithm of the exploration noise before the tanh."""
+    noise_correlation: float = 0.0
+    """Correlation of the exploration noise of successive steps, in [0, 1)."""
+    hidden: tuple[int, ...] = (256, 256)
+    """Widths of the hidden layers of actor and critics."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides the outcome of a run."""
+
+    env: str
+    """Task id."""
+    agent: str
+    """Learner."""
+    guidance: str
+    """`affordance` or `none`."""
+    seed: int = 0
+    """Seed of everything random."""
+    total_steps: int = 300_000
+    """Environment steps, summed over all environments."""
+    num_envs: int = 32
+    """Environments in each worker."""
+    workers: int = 1
+    """Worker processes; 0 collects in the main process."""
+    eval_every: int = 50_000
+    """Environment steps between evaluations."""
+    eval_episodes: int = 64
+    """Episodes of a periodic evaluation."""
+    final_episodes: int = 200
+    """Episodes of the last evaluation, which `result.json` reports."""
+    eval_envs: int = 32
+    """Environments of the evaluation task."""
+    stop_success: float | None = None
+    """End when two successive evaluations reach this success rate."""
+    checkpoint_seconds: float = 15.0
+    """Wall time between checkpoints, s."""
+    normaliser_samples: int = 300_000
+    """Observations after which the observation normaliser stays as it is."""
+    stagger: bool = True
+    """End the first episodes at random steps, so that resets spread over time."""
+    learner: PPOConfig | SACConfig = field(default_factory=PPOConfig)
+    """Settings of the learner."""
+
+    def digest(self) -> str:
+        """Twelve hexadecimal digits that differ between settings; `total_steps` may grow and is left out."""
+        content = dataclasses.asdict(self)
+        del content["total_steps"]
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
+
+
+LEARNER_CONFIGS: dict[str, type[PPOConfig] | type[SACConfig]] = {"ppo": PPOConfig, "sac": SACConfig}
+
+
+def config_from_dict(content: dict[str, Any]) -> RunConfig:
+    """Rebuild a `RunConfig` from what `dataclasses.asdict` made of it.
+
+    Raises:
+        TypeError, KeyError: if names are missing or unknown.
+    """
+    learner = dict(content["learner"]) | {"hidden": tuple(content["learner"]["hidden"])}
+    return RunConfig(**(dict(content) | {"learner": LEARNER_CONFIGS[content["agent"]](**learner)}))

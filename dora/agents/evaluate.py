@@ -1,0 +1,86 @@
+"""Evaluation: episodes on fixed seeds, with a policy that does not explore."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from tensordict import TensorDict
+from torch import Tensor
+
+from dora.agents.env import EpisodeColumns, TaskEnv
+
+PERIODIC_SEED = 1_000_000_000  # first episode seed of evaluations during training; training seeds are below
+FINAL_SEED = 1_500_000_000  # first episode seed of the evaluation that a result reports
+
+Act = Callable[[Float[Tensor, "n o"]], Float[Tensor, "n a"]]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Statistics of evaluation episodes, one row each.
+
+    columns: what the columns of `table` are.
+    table: (E, K) values at the end of each episode.
+    """
+
+    columns: EpisodeColumns
+    table: Float[Tensor, "e k"]
+
+    def values(self, name: str) -> Float[Tensor, " e"]:
+        """One column, sums of logged terms as means per step."""
+        return self.columns.column(self.table, name)
+
+    @property
+    def success_rate(self) -> float:
+        """Share of episodes that end in success."""
+        return float(self.values("success").mean())
+
+    @property
+    def return_mean(self) -> float:
+        """Mean sum of rewards."""
+        return float(self.values("return").mean())
+
+    @property
+    def stage_rates(self) -> dict[str, float]:
+        """Share of episodes that reached each stage."""
+        prefix = "stage/"
+        return {
+            name.removeprefix(prefix): float(self.values(name).mean())
+            for name in self.columns.highest
+            if name.startswith(prefix)
+        }
+
+    def penetration_mm(self, quantile: float = 1.0) -> float | None:
+        """Quantile over the episodes of their deepest penetration, mm; None if the task reports none."""
+        if "penetration_mm" not in self.columns.highest:
+            return None
+        return float(self.values("penetration_mm").quantile(quantile))
+
+    def rows(self) -> tuple[tuple[str, ...], list[list[float]]]:
+        """Header and rows of `eval.csv`: episode number, then every column."""
+        names = tuple(n for n in self.columns.names if n != "whole")
+        values = torch.stack([self.values(n) for n in names], 1).tolist()
+        return ("episode", *names), [[i, *row] for i, row in enumerate(values)]
+
+
+@torch.no_grad()
+def evaluate(env: TaskEnv, act: Act, episodes: int, first_seed: int) -> Evaluation:
+    """Run `episodes` episodes with seeds first_seed, first_seed + 1, ...
+
+    Episode i has the same seed whatever the number of environments. Rows that end early idle until all end.
+    """
+    tables: list[Tensor] = []
+    n = env.batch_size[0]
+    for start in range(0, episodes, n):
+        data = env.restart([first_seed + start + row for row in range(n)])
+        table = torch.zeros_like(data["statistics"])
+        running = torch.ones(n, dtype=torch.bool)
+        while running.any():
+            action = act(data["observation"])
+            data = env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
+            ended = running & data["done"][:, 0]
+            table[ended] = data["statistics"][ended]
+            running &= ~ended
+        tables.append(table[: episodes - start])
+    return Evaluation(env.columns, torch.cat(tables))

@@ -1,0 +1,106 @@
+"""A trained policy at work: evaluation of a checkpoint, and films."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from dora.agents.checkpoint import Checkpoint, check_belongs, read_checkpoint, unpack_modules
+from dora.agents.config import RunConfig
+from dora.agents.env import Task, TaskEnv
+from dora.agents.evaluate import FINAL_SEED, Act, Evaluation, evaluate
+from dora.agents.networks import Policy
+from dora.agents.trainer import MakeTask, make_learner
+
+FRAMES_PER_SECOND = 20  # of a film, if the task does not say its control frequency
+
+
+def checkpoint_path(path: Path) -> Path:
+    """The file meant by `path`: itself, or the best checkpoint of a run folder."""
+    return path / "checkpoints" / "best.safetensors" if path.is_dir() else path
+
+
+def load_policy(checkpoint: Checkpoint, path: Path) -> Policy:
+    """The policy of a checkpoint.
+
+    Raises:
+        InputError: if its tensors do not fit its settings.
+    """
+    policy = make_learner(checkpoint.config, *checkpoint.sizes).policy
+    modules = {"normaliser": policy.normaliser, "actor": policy.actor}
+    unpack_modules(modules, checkpoint.tensors, path)
+    return policy
+
+
+def evaluate_checkpoint(
+    path: Path, config: RunConfig, make_task: MakeTask
+) -> tuple[Checkpoint, Evaluation, Evaluation | None]:
+    """Evaluate a checkpoint on the seeds of final evaluations; with guidance also no correction.
+
+    Raises:
+        InputError: if it is no checkpoint or belongs to another task, learner or guidance.
+    """
+    checkpoint = read_checkpoint(path)
+    env = TaskEnv(make_task(config.eval_envs))
+    try:
+        action_size = env.action_spec.shape[-1]
+        sizes = (env.observation_spec["observation"].shape[-1], action_size)
+        check_belongs(checkpoint, path, config, sizes, exactly=False)
+        policy = load_policy(checkpoint, path)
+        evaluation = evaluate(env, policy.greedy, config.final_episodes, FINAL_SEED)
+        zero = None
+        if config.guidance == "affordance":
+
+            def still(observation: Float[Tensor, "n o"]) -> Float[Tensor, "n a"]:
+                return torch.zeros(len(observation), action_size)
+
+            zero = evaluate(env, still, config.final_episodes, FINAL_SEED)
+        return checkpoint, evaluation, zero
+    finally:
+        env.close()
+
+
+def record(make_task: Callable[[], Task], act: Act, path: Path, episodes: int) -> None:
+    """Film whole episodes of a task with one environment that can `render()`, one after the other.
+
+    Raises:
+        RuntimeError: if nothing can be rendered, for want of a driver.
+    """
+    task: Any = make_task()
+    try:
+        low, high = (
+            torch.as_tensor(x) for x in (task.single_action_space.low, task.single_action_space.high)
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with torch.no_grad():
+            first = _frames(task, act, FINAL_SEED, low, high)
+            rate = getattr(task, "control_freq", FRAMES_PER_SECOND)
+            with imageio.get_writer(path, fps=rate, macro_block_size=8) as writer:
+                for episode in range(episodes):
+                    frames = first if episode == 0 else _frames(task, act, FINAL_SEED + episode, low, high)
+                    for frame in frames:
+                        writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
+    finally:
+        task.close()
+
+
+def _frames(task: Any, act: Act, seed: int, low: Tensor, high: Tensor) -> list[np.ndarray]:
+    observation, _ = task.reset(seed=seed)
+    frames = [_picture(task.render())]
+    for _ in range(task.max_steps):
+        observation, _, _, _, info = task.step(act(observation).clamp(low, high))
+        frames.append(_picture(task.render()))
+        if "fail" in info and bool(info["fail"].any()):
+            break
+    return frames
+
+
+def _picture(image: Any) -> UInt8[np.ndarray, "h w 3"]:
+    """What `render` returned as one (h, w, 3) picture of bytes."""
+    array = image.cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
+    return array.reshape(array.shape[-3:]).astype(np.uint8)

@@ -1,0 +1,180 @@
+"""Proximal policy optimisation with TorchRL's `ClipPPOLoss` and generalised advantages."""
+
+import torch
+from jaxtyping import Bool, Float
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules import IndependentNormal
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value.functional import generalized_advantage_estimate
+
+from dora.agents.config import PPOConfig
+from dora.agents.networks import Critic, GaussianActor, Normaliser, Policy, for_loss
+
+ADAM_EPSILON = 1e-5
+LEARNING_RATE_DOWN, LEARNING_RATE_UP = 1.3, 1.2  # factors of the adaptation
+KL_BAND = 2.0  # the learning rate changes outside target_kl / KL_BAND .. target_kl * KL_BAND
+ADVANTAGE_FLOOR = 1e-6  # smallest standard deviation by which advantages are divided
+
+
+class PPO:
+    """Learns from one batch of fresh transitions at a time.
+
+    The learning rate falls by 1.3 when the divergence from the old policy exceeds twice its target and
+    rises by 1.2 when it is below half of it.
+    """
+
+    replay = None
+
+    def __init__(self, config: PPOConfig, observation: int, action: int, normaliser_samples: int):
+        self.config = config
+        self.rollout = config.rollout
+        self.normaliser = Normaliser(observation, normaliser_samples)
+        self.actor = GaussianActor(observation, action, config.hidden, config.log_std)
+        self.critic = Critic(observation, config.hidden, nn.ELU, layer_norm=False)
+        self.policy = Policy(self.normaliser, self.actor, config.noise_correlation)
+        self.learning_rate = config.learning_rate
+        self.loss = ClipPPOLoss(
+            for_loss(self.actor, IndependentNormal),
+            TensorDictModule(self.critic, in_keys=["features"], out_keys=["state_value"]),
+            clip_epsilon=config.clip,
+            entropy_coeff=config.entropy,
+            critic_coeff=config.value,
+            loss_critic_type="l2",
+            normalize_advantage=False,
+            functional=False,
+        )
+        self._mean = torch.empty(0)  # mean actions of the latest forward pass
+        self.actor.register_forward_hook(self._keep_mean)
+        self.parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate, eps=ADAM_EPSILON)
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        """What a checkpoint holds, by name."""
+        return {"normaliser": self.normaliser, "actor": self.actor, "critic": self.critic}
+
+    @property
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """Optimisers, by name."""
+        return {"adam": self.optimiser}
+
+    def counters(self) -> dict[str, float]:
+        """The adapted learning rate."""
+        return {"learning_rate": self.learning_rate}
+
+    def set_counters(self, counters: dict[str, float]) -> None:
+        """Restore `counters`."""
+        self.set_learning_rate(counters["learning_rate"])
+
+    def set_learning_rate(self, value: float) -> None:
+        """Use `value` from the next gradient step on."""
+        self.learning_rate = value
+        for group in self.optimiser.param_groups:
+            group["lr"] = value
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """Learn from a batch (N, T) and return the means of the losses by name.
+
+        The very first batch only sets the normaliser, since unscaled observations would teach nothing good.
+        """
+        if self.normaliser.count == 0:
+            self.normaliser.update(batch["observation"])
+            return {}
+        data = self._prepare(batch)
+        losses: list[Tensor] = []
+        divergences: list[Tensor] = []
+        for _ in range(self.config.epochs):
+            divergences.clear()
+            for index in torch.randperm(len(data)).split(self.config.minibatch):
+                values = self._step(data[index])
+                losses.append(values)
+                divergences.append(values[-1])
+        divergence = float(torch.stack(divergences).mean())
+        self._adapt(divergence)
+        means = torch.stack(losses).mean(0).tolist()
+        self.normaliser.update(batch["observation"])
+        names = ("policy", "value", "entropy", "bound", "clip_fraction", "grad_norm")
+        return dict(zip(names, means[:-1], strict=True)) | {
+            "kl": divergence,
+            "learning_rate": self.learning_rate,
+            "action_std": float(self.actor.log_std.detach().exp().mean()),
+            "explained_variance": float(data["explained"][0]),
+        }
+
+    @torch.no_grad()
+    def _prepare(self, batch: TensorDictBase) -> TensorDict:
+        """Flatten a batch (N, T) into transitions with normalised observations and advantages."""
+        features = self.normaliser(batch["observation"])
+        following = self.normaliser(batch["next", "observation"])
+        value, next_value = self.critic(features), self.critic(following)
+        advantage, target = advantages(
+            self.config.gamma,
+            self.config.gae_lambda,
+            value,
+            next_value,
+            batch["next", "reward"],
+            batch["next", "done"],
+            batch["next", "terminated"],
+        )
+        explained = 1 - (target - value).var() / target.var().clamp_min(ADVANTAGE_FLOOR)
+        return TensorDict(
+            {
+                "features": features,
+                "action": batch["action"],
+                "action_log_prob": batch["action_log_prob"],
+                "advantage": advantage,
+                "value_target": target,
+                "explained": explained.expand_as(value[..., 0]),
+            },
+            batch_size=batch.shape,
+        ).flatten()
+
+    def _step(self, minibatch: TensorDict) -> Float[Tensor, " 7"]:
+        """One gradient step; returns the losses, the gradient's norm and the divergence."""
+        advantage = minibatch["advantage"]
+        minibatch["advantage"] = (advantage - advantage.mean()) / (advantage.std() + ADVANTAGE_FLOOR)
+        out = self.loss(minibatch)
+        bound = (self._mean.abs() - 1).clamp_min(0).square().sum(-1).mean()
+        total = out["loss_objective"] + out["loss_entropy"] + out["loss_critic"] + self.config.bound * bound
+        self.optimiser.zero_grad()
+        total.backward()
+        norm = nn.utils.clip_grad_norm_(self.parameters, self.config.grad_norm)
+        self.optimiser.step()
+        with torch.no_grad():
+            self.actor.log_std.clamp_(self.config.log_std_min, 0.0)
+        names = ("loss_objective", "loss_critic", "entropy")
+        values = [out[name].mean() for name in names] + [bound, out["clip_fraction"].mean(), norm]
+        return torch.stack([v.detach() for v in values] + [out["kl_approx"].detach().mean()])
+
+    def _keep_mean(self, module: nn.Module, inputs: object, outputs: tuple[Tensor, Tensor]) -> None:
+        """Forward hook: `ClipPPOLoss` hides the distribution whose mean the bound penalty needs."""
+        self._mean = outputs[0]
+
+    def _adapt(self, divergence: float) -> None:
+        config, rate = self.config, self.learning_rate
+        if divergence > config.target_kl * KL_BAND:
+            rate = max(rate / LEARNING_RATE_DOWN, config.learning_rate_min)
+        elif divergence < config.target_kl / KL_BAND:
+            rate = min(rate * LEARNING_RATE_UP, config.learning_rate_max)
+        self.set_learning_rate(rate)
+
+
+def advantages(
+    gamma: float,
+    gae_lambda: float,
+    value: Float[Tensor, "n t 1"],
+    next_value: Float[Tensor, "n t 1"],
+    reward: Float[Tensor, "n t 1"],
+    done: Bool[Tensor, "n t 1"],
+    terminated: Bool[Tensor, "n t 1"],
+) -> tuple[Float[Tensor, "n t 1"], Float[Tensor, "n t 1"]]:
+    """Generalised advantages and value targets (Schulman et al. 2016).
+
+    A truncated episode bootstraps from `next_value` of its true last observation, a terminated one does not.
+    """
+    advantage, target = generalized_advantage_estimate(
+        gamma, gae_lambda, value, next_value, reward, done=done, terminated=terminated
+    )
+    return advantage, target

@@ -1,0 +1,157 @@
+"""The folder of a run: what is where, and what `result.json` contains."""
+
+import dataclasses
+import importlib.metadata
+import platform
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dora.agents.config import RunConfig, config_from_dict
+from dora.agents.evaluate import Evaluation
+from dora.agents.files import write_bytes, write_csv, write_json
+from dora.errors import InputError
+
+PACKAGES = ("dora", "mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
+CURVE_HEADER = (
+    "env_steps",
+    "wall_seconds",
+    "success_rate",
+    "return_mean",
+    "penetration_p95_mm",
+    "training_success_rate",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFolder:
+    """Paths and writers of one run.
+
+    `config.yaml`, `versions.txt`, TensorBoard events, `checkpoints/{latest,best}.safetensors`,
+    `checkpoints/replay/` (SAC), `curve.csv` (one row per evaluation), `eval.csv` (one row per episode of the
+    last evaluation), `result.json`, `video/`.
+    """
+
+    path: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.path / "checkpoints"
+
+    @property
+    def latest(self) -> Path:
+        """Checkpoint from which `--resume` goes on."""
+        return self.checkpoints / "latest.safetensors"
+
+    @property
+    def best(self) -> Path:
+        """Checkpoint of the best evaluation."""
+        return self.checkpoints / "best.safetensors"
+
+    @property
+    def replay(self) -> Path:
+        """Folder of the replay buffer."""
+        return self.checkpoints / "replay"
+
+    @property
+    def video(self) -> Path:
+        """Folder of films."""
+        return self.path / "video"
+
+    def create(self, config: RunConfig) -> None:
+        """Make the folder and write `config.yaml` and `versions.txt`.
+
+        Raises:
+            InputError: if it cannot be written or holds a run already.
+        """
+        if (self.path / "config.yaml").exists():
+            raise InputError(
+                f"{self.path} holds a run already: continue it with --resume or choose another --out."
+            )
+        try:
+            self.checkpoints.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"Cannot make the run folder {self.path} ({error.strerror}): choose another --out."
+            ) from error
+        self.write_config(config)
+        write_bytes(self.path / "versions.txt", _versions().encode())
+
+    def write_config(self, config: RunConfig) -> None:
+        """Write `config.yaml`."""
+        content = dataclasses.asdict(config)
+        content["learner"]["hidden"] = list(content["learner"]["hidden"])
+        write_bytes(self.path / "config.yaml", yaml.safe_dump(content, sort_keys=False).encode())
+
+    def read_config(self) -> RunConfig:
+        """Settings of the run.
+
+        Raises:
+            InputError: if this is not a run folder.
+        """
+        try:
+            return config_from_dict(yaml.safe_load((self.path / "config.yaml").read_text()))
+        except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{self.path} is not a run folder (it has no readable config.yaml): give one that a run printed."
+            ) from error
+
+    def write_curve(self, rows: list[list[float]]) -> None:
+        """Write `curve.csv`."""
+        write_csv(self.path / "curve.csv", CURVE_HEADER, rows)
+
+    def write_evaluation(self, evaluation: Evaluation) -> None:
+        """Write `eval.csv`."""
+        write_csv(self.path / "eval.csv", *evaluation.rows())
+
+    def write_result(self, result: dict[str, Any]) -> None:
+        """Write `result.json`."""
+        write_json(self.path / "result.json", result)
+
+
+def make_result(
+    config: RunConfig,
+    *,
+    env_steps: int,
+    wall_seconds: float,
+    episodes: int,
+    evaluation: Evaluation | None,
+    zero: Evaluation | None,
+    finished: bool,
+) -> dict[str, Any]:
+    """Content of `result.json`; rates are null where nothing was evaluated."""
+    rate = env_steps / wall_seconds if wall_seconds > 0 else 0.0
+    some = evaluation
+    return {
+        "env": config.env,
+        "agent": config.agent,
+        "guidance": config.guidance,
+        "seed": config.seed,
+        "env_steps": env_steps,
+        "wall_seconds": round(wall_seconds, 3),
+        "env_steps_per_second": round(rate, 1),
+        "episodes": episodes,
+        "success_rate": some.success_rate if some else None,
+        "zero_success_rate": zero.success_rate if zero else None,
+        "stage_rates": some.stage_rates if some else {},
+        "return_mean": some.return_mean if some else None,
+        "penetration_max_mm": some.penetration_mm() if some else None,
+        "num_envs": config.num_envs,
+        "workers": config.workers,
+        "config_digest": config.digest(),
+        "finished": finished,
+        "eval_episodes": len(some.table) if some else 0,
+        "penetration_p95_mm": some.penetration_mm(0.95) if some else None,
+    }
+
+
+def _versions() -> str:
+    lines = [f"python {platform.python_version()}", f"platform {platform.platform()}"]
+    for name in PACKAGES:
+        try:
+            lines.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            lines.append(f"{name} not installed")
+    return "\n".join(lines) + "\n"

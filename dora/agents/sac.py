@@ -1,0 +1,124 @@
+"""Soft actor-critic with TorchRL's `SACLoss` and a replay buffer."""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules import TanhNormal
+from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
+
+from dora.agents.config import SACConfig
+from dora.agents.networks import Critic, Normaliser, Policy, TanhActor, for_loss
+from dora.agents.replay import Replay
+
+ACTOR_PERIOD = 2  # gradient steps of the critics per step of actor and temperature
+
+
+class SAC:
+    """Adds each batch to the replay buffer, then takes `updates_per_step` gradient steps per transition.
+
+    Observations are stored as they are and normalised when sampled. Truncated episodes bootstrap from their
+    true last observation, because targets look at `terminated` only.
+    """
+
+    def __init__(self, config: SACConfig, observation: int, action: int, normaliser_samples: int):
+        self.config = config
+        self.rollout = config.rollout
+        self.normaliser = Normaliser(observation, normaliser_samples)
+        self.actor = TanhActor(observation, action, config.hidden, config.log_std)
+        self.policy = Policy(self.normaliser, self.actor, config.noise_correlation)
+        self.loss = SACLoss(
+            for_loss(self.actor, TanhNormal),
+            TensorDictModule(
+                Critic(observation + action, config.hidden, nn.ReLU, layer_norm=True),
+                in_keys=["features", "action"],
+                out_keys=["state_action_value"],
+            ),
+            loss_function="l2",
+            alpha_init=config.alpha,
+            target_entropy=config.target_entropy * action,
+        )
+        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
+        self.target = SoftUpdate(self.loss, tau=config.polyak)
+        self.actor_parameters = _leaves(self.loss.actor_network_params)
+        self.critic_parameters = _leaves(self.loss.qvalue_network_params)
+        self.optimisers: dict[str, torch.optim.Optimizer] = {
+            "actor_adam": torch.optim.Adam(self.actor_parameters, lr=config.learning_rate),
+            "critic_adam": torch.optim.Adam(self.critic_parameters, lr=config.learning_rate),
+            "alpha_adam": torch.optim.Adam([self.loss.log_alpha], lr=config.learning_rate_alpha),
+        }
+        self.replay = Replay(config.capacity, config.batch)
+        self.updates, self.due = 0, 0.0
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        """What a checkpoint holds, by name."""
+        return {"normaliser": self.normaliser, "actor": self.actor, "loss": self.loss}
+
+    def counters(self) -> dict[str, float]:
+        """Gradient steps taken and due, transitions seen."""
+        return {"updates": self.updates, "due": self.due, "added": self.replay.added}
+
+    def set_counters(self, counters: dict[str, float]) -> None:
+        """Restore `counters`."""
+        self.updates, self.due = int(counters["updates"]), counters["due"]
+        self.replay.added = int(counters["added"])
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """Store a batch (N, T), learn from the replay buffer and return the means of the losses by name."""
+        following = batch["next"].select("observation", "reward", "done", "terminated")
+        stored = batch.select("observation", "action").set("next", following)
+        self.replay.extend(stored.flatten().clone())
+        self.normaliser.update(batch["observation"])
+        if self.replay.added < self.config.warmup:
+            return {"replay": float(len(self.replay))}
+        self.due += batch.numel() * self.config.updates_per_step
+        critic: list[Tensor] = []
+        actor: list[Tensor] = []
+        while self.due >= 1.0:
+            self.due -= 1.0
+            sample = self._sample()
+            critic.append(self._learn_critic(sample))
+            if self.updates % ACTOR_PERIOD == 0:
+                actor.append(self._learn_actor(sample))
+            self.target.step()
+            self.updates += 1
+        values = {"updates": float(self.updates), "replay": float(len(self.replay))}
+        if critic:
+            values["qvalue"] = float(torch.stack(critic).mean())
+        if actor:
+            names = ("actor", "alpha", "entropy")
+            values |= dict(zip(names, torch.stack(actor).mean(0).tolist(), strict=True))
+        return values
+
+    @torch.no_grad()
+    def _sample(self) -> TensorDict:
+        sample = self.replay.sample()
+        sample["features"] = self.normaliser(sample["observation"])
+        sample["next", "features"] = self.normaliser(sample["next", "observation"])
+        return sample
+
+    def _learn_critic(self, sample: TensorDict) -> Tensor:
+        loss, _ = self.loss.qvalue_v2_loss(sample)
+        _descend(self.optimisers["critic_adam"], loss)
+        return loss.detach()
+
+    def _learn_actor(self, sample: TensorDict) -> Tensor:
+        loss, metadata = self.loss.actor_loss(sample)
+        _descend(self.optimisers["actor_adam"], loss)
+        log_prob = metadata["log_prob"]
+        alpha_loss = self.loss.alpha_loss(log_prob).mean()
+        _descend(self.optimisers["alpha_adam"], alpha_loss)
+        return torch.stack([loss.detach(), self.loss.log_alpha.detach().exp(), -log_prob.mean()])
+
+
+def _leaves(parameters: Any) -> list[Tensor]:
+    return list(parameters.values(include_nested=True, leaves_only=True))
+
+
+def _descend(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
+    optimiser.zero_grad()
+    loss.backward()
+    optimiser.step()

@@ -1,0 +1,347 @@
+"""The training loop that PPO and SAC share."""
+
+import functools
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from dora.agents.checkpoint import (
+    Checkpoint,
+    check_belongs,
+    pack_modules,
+    pack_optimisers,
+    pack_rng,
+    read_checkpoint,
+    unpack_modules,
+    unpack_optimisers,
+    unpack_rng,
+)
+from dora.agents.collect import Rollouts
+from dora.agents.config import PPOConfig, RunConfig
+from dora.agents.env import EpisodeColumns, Task, TaskEnv, ended_episodes
+from dora.agents.evaluate import FINAL_SEED, PERIODIC_SEED, Evaluation, evaluate
+from dora.agents.interrupt import Interrupt
+from dora.agents.logging import RunLog
+from dora.agents.networks import Policy
+from dora.agents.ppo import PPO
+from dora.agents.progress import ProgressReport
+from dora.agents.replay import Replay
+from dora.agents.runfolder import RunFolder, make_result
+from dora.agents.sac import SAC
+
+TRAINING_SEEDS = 1_000_000_000  # seeds of training are below, those of evaluation above
+RECENT = 200  # training episodes over which the shown success rate is taken
+
+MakeTask = Callable[[int], Task]
+"""Makes a task with the given number of environments; picklable."""
+
+
+class Learner(Protocol):
+    """What the training loop needs of an algorithm."""
+
+    policy: Policy
+    rollout: int
+    replay: Replay | None
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        """Networks and normaliser."""
+        ...
+
+    @property
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """Optimisers."""
+        ...
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """Learn from a batch (N, T) of fresh transitions; losses and other values by name."""
+        ...
+
+    def counters(self) -> dict[str, float]:
+        """Numbers besides the modules' that a checkpoint has to keep."""
+        ...
+
+    def set_counters(self, counters: dict[str, float]) -> None:
+        """Restore `counters`."""
+        ...
+
+
+def make_learner(config: RunConfig, observation: int, action: int) -> PPO | SAC:
+    """The learner of a run, with weights drawn from torch's global generator."""
+    settings = config.learner
+    if isinstance(settings, PPOConfig):
+        return PPO(settings, observation, action, config.normaliser_samples)
+    return SAC(settings, observation, action, config.normaliser_samples)
+
+
+def seeds_for(seed: int, step: int, count: int) -> list[int]:
+    """`count` independent seeds in [0, 1e9), different for every (seed, step)."""
+    state = np.random.SeedSequence([seed, step]).generate_state(count, np.uint64)
+    return [int(s % TRAINING_SEEDS) for s in state]
+
+
+@dataclass
+class Counters:
+    """Where a run stands; what a checkpoint keeps besides tensors."""
+
+    env_steps: int = 0
+    wall_seconds: float = 0.0
+    episodes: int = 0
+    next_evaluation: int = 0
+    best: list[float] | None = None
+    """Success rate and return of the best evaluation."""
+    reached: int = 0
+    """Successive evaluations that reached `stop_success`."""
+    curve: list[list[float]] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=lambda: {"collect": 0.0, "learn": 0.0, "evaluate": 0.0})
+
+
+class Trainer:
+    """One run: trains, evaluates, logs and saves in a run folder.
+
+    Args:
+        config: settings.
+        make_task: makes tasks for workers and for evaluation.
+        folder: an existing run folder.
+        resume: go on from the folder's latest checkpoint.
+
+    Raises:
+        InputError: if the checkpoint does not fit.
+    """
+
+    def __init__(self, config: RunConfig, make_task: MakeTask, folder: RunFolder, *, resume: bool = False):
+        self.config, self.make_task, self.folder = config, make_task, folder
+        self.counters = Counters(next_evaluation=config.eval_every)
+        self._evaluation_env = TaskEnv(make_task(config.eval_envs))
+        self.columns: EpisodeColumns = self._evaluation_env.columns
+        self.sizes = (
+            self._evaluation_env.observation_spec["observation"].shape[-1],
+            self._evaluation_env.action_spec.shape[-1],
+        )
+        weights_seed, self._exploration_seed = seeds_for(config.seed, 0, 2)
+        torch.manual_seed(weights_seed)
+        self.learner: PPO | SAC = make_learner(config, *self.sizes)
+        torch.manual_seed(self._exploration_seed)
+        self._recent = torch.zeros(0, len(self.columns.names))
+        self._resumed: dict[str, Tensor] | None = None
+        self._last_evaluation: Evaluation | None = None
+        if resume:
+            self._load()
+
+    def run(self) -> dict[str, Any]:
+        """Train until the budget is spent or `stop_success` is reached; returns what `result.json` got.
+
+        After Ctrl-C the state is saved and the result has `finished` false.
+        """
+        first_step = self.counters.env_steps
+        with Interrupt() as interrupt:
+            log = RunLog(self.folder.path, first_step)
+            finished = False
+            try:
+                with self._rollouts() as rollouts, ProgressReport(self.config.total_steps) as progress:
+                    self._train(rollouts, log, progress, interrupt)
+                self.save()
+                evaluation, zero = self._final_evaluation(interrupt)
+                finished = True
+            except KeyboardInterrupt:
+                self.save()
+                evaluation, zero = self._last_evaluation, None
+            finally:
+                log.close()
+                self._evaluation_env.close()
+        result = make_result(
+            self.config,
+            env_steps=self.counters.env_steps,
+            wall_seconds=self.counters.wall_seconds,
+            episodes=self.counters.episodes,
+            evaluation=evaluation,
+            zero=zero,
+            finished=finished,
+        )
+        if evaluation is not None:
+            self.folder.write_evaluation(evaluation)
+        self.folder.write_result(result)
+        return result
+
+    def _rollouts(self) -> Rollouts:
+        config = self.config
+        rollouts = Rollouts(
+            functools.partial(self.make_task, config.num_envs),
+            self.learner.policy,
+            workers=config.workers,
+            num_envs=config.num_envs,
+            rollout=self.learner.rollout,
+            seeds=seeds_for(config.seed, self.counters.env_steps + 1, max(config.workers, 1)),
+            stagger=config.stagger,
+        )
+        if self._resumed is not None:
+            unpack_rng(self._resumed)
+        else:
+            torch.manual_seed(self._exploration_seed)
+        return rollouts
+
+    def _train(self, rollouts: Rollouts, log: RunLog, progress: ProgressReport, interrupt: Interrupt) -> None:
+        counters, config = self.counters, self.config
+        saved = time.monotonic()
+        while counters.env_steps < config.total_steps:
+            interrupt.check()
+            start = time.perf_counter()
+            batch = rollouts.collect()
+            collected = time.perf_counter()
+            values = self.learner.update(batch)
+            rollouts.push()
+            counters.env_steps += batch.numel()
+            ended = ended_episodes(batch["next", "done"], batch["next", "statistics"], self.columns)
+            counters.episodes += len(ended)
+            learned = time.perf_counter()
+            self._spend("collect", collected - start)
+            self._spend("learn", learned - collected)
+            rate = batch.numel() / (learned - start)
+            self._log_iteration(log, values, ended, rate)
+            if self._evaluation_is_due() and self._evaluate(log, progress, interrupt):
+                break
+            if time.monotonic() - saved > config.checkpoint_seconds:
+                self.save()
+                saved = time.monotonic()
+            mean_rate = counters.env_steps / max(counters.wall_seconds, 1e-9)
+            best = counters.curve[-1][2] if counters.curve else None
+            progress.update(counters.env_steps, mean_rate, self._training_success(), best)
+
+    def _spend(self, what: str, seconds: float) -> None:
+        self.counters.seconds[what] += seconds
+        self.counters.wall_seconds += seconds
+
+    def _training_success(self) -> float | None:
+        if len(self._recent) == 0:
+            return None
+        return float(self.columns.column(self._recent, "success").mean())
+
+    def _log_iteration(
+        self, log: RunLog, values: dict[str, float], ended: Float[Tensor, "e k"], rate: float
+    ) -> None:
+        counters = self.counters
+        step = counters.env_steps
+        log.add_learner(values, step)
+        shares = {f"{k}_share": v / counters.wall_seconds for k, v in counters.seconds.items()}
+        log.add("speed", {"steps_per_second": rate, **shares}, step)
+        if len(ended) == 0:
+            return
+        self._recent = torch.cat([self._recent, ended])[-RECENT:]
+        renamed = {"success": "success_rate", "return": "return_mean", "length": "length_mean"}
+        means = {
+            renamed.get(name, name): float(self.columns.column(ended, name).mean())
+            for name in self.columns.names
+            if name != "whole"
+        }
+        log.add("episode", means, step)
+
+    def _evaluation_is_due(self) -> bool:
+        return self.counters.env_steps >= self.counters.next_evaluation
+
+    def _evaluate(self, log: RunLog, progress: ProgressReport, interrupt: Interrupt) -> bool:
+        """Evaluate, keep the policy if it is the best so far, and tell whether the run may end."""
+        counters, config = self.counters, self.config
+        start = time.perf_counter()
+        evaluation = self._run_evaluation(config.eval_episodes, PERIODIC_SEED, self._greedy, interrupt)
+        self._spend("evaluate", time.perf_counter() - start)
+        while counters.next_evaluation <= counters.env_steps:
+            counters.next_evaluation += config.eval_every
+        self._last_evaluation = evaluation
+        success, mean_return = evaluation.success_rate, evaluation.return_mean
+        depth = evaluation.penetration_mm(0.95)
+        log.add("evaluation", {"success_rate": success, "return_mean": mean_return}, counters.env_steps)
+        log.add("evaluation/stage", evaluation.stage_rates, counters.env_steps)
+        if depth is not None:
+            log.add("evaluation", {"penetration_p95_mm": depth}, counters.env_steps)
+        training = self._training_success()
+        row = [success, mean_return, _or_nan(depth), _or_nan(training)]
+        counters.curve.append([counters.env_steps, round(counters.wall_seconds, 2), *row])
+        self.folder.write_curve(counters.curve)
+        progress.say(
+            f"{counters.env_steps:,} steps, {counters.wall_seconds:.0f} s: success {success:.3f}, "
+            f"return {mean_return:.2f}" + (f", penetration p95 {depth:.1f} mm" if depth is not None else "")
+        )
+        if counters.best is None or [success, mean_return] > counters.best:
+            counters.best = [success, mean_return]
+            self._checkpoint(pack_modules(self.learner.modules)).write(self.folder.best)
+        reached = config.stop_success is not None and success >= config.stop_success
+        counters.reached = counters.reached + 1 if reached else 0
+        return counters.reached >= 2
+
+    def _greedy(self, observation: Float[Tensor, "n o"]) -> Float[Tensor, "n a"]:
+        return self.learner.policy.greedy(observation)
+
+    def _zero(self, observation: Float[Tensor, "n o"]) -> Float[Tensor, "n a"]:
+        return torch.zeros(len(observation), self.sizes[1])
+
+    def _run_evaluation(
+        self,
+        episodes: int,
+        first_seed: int,
+        act: Callable[[Tensor], Tensor],
+        interrupt: Interrupt,
+    ) -> Evaluation:
+        def checked(observation: Tensor) -> Tensor:
+            interrupt.check()
+            return act(observation)
+
+        with torch.random.fork_rng(devices=[]):
+            return evaluate(self._evaluation_env, checked, episodes, first_seed)
+
+    def _final_evaluation(self, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
+        """Evaluate the best policy, and no correction, on seeds that chose nothing."""
+        start = time.perf_counter()
+        if self.folder.best.exists():
+            best = read_checkpoint(self.folder.best)
+            unpack_modules(self.learner.modules, best.tensors, self.folder.best)
+        else:
+            self._checkpoint(pack_modules(self.learner.modules)).write(self.folder.best)
+        episodes = self.config.final_episodes
+        evaluation = self._run_evaluation(episodes, FINAL_SEED, self._greedy, interrupt)
+        zero = None
+        if self.config.guidance == "affordance":
+            zero = self._run_evaluation(episodes, FINAL_SEED, self._zero, interrupt)
+        self._spend("evaluate", time.perf_counter() - start)
+        return evaluation, zero
+
+    def save(self) -> None:
+        """Write the latest checkpoint.
+
+        Raises:
+            InputError: if the disk is full; the previous checkpoint survives.
+        """
+        replay = self.learner.replay
+        if replay is not None:
+            replay.save(self.folder.replay)
+        tensors = pack_modules(self.learner.modules) | pack_optimisers(self.learner.optimisers) | pack_rng()
+        self._checkpoint(tensors).write(self.folder.latest)
+        if replay is not None:
+            replay.forget_old_files(self.folder.replay)
+
+    def _checkpoint(self, tensors: dict[str, Tensor]) -> Checkpoint:
+        progress = dict(vars(self.counters)) | {"learner": self.learner.counters()}
+        return Checkpoint(self.config, self.sizes, tensors, progress)
+
+    def _load(self) -> None:
+        path = self.folder.latest
+        checkpoint = read_checkpoint(path)
+        check_belongs(checkpoint, path, self.config, self.sizes, exactly=True)
+        unpack_modules(self.learner.modules, checkpoint.tensors, path)
+        unpack_optimisers(self.learner.optimisers, checkpoint.tensors)
+        progress = dict(checkpoint.progress)
+        self.learner.set_counters(progress.pop("learner"))
+        self.counters = Counters(**progress)
+        if self.learner.replay is not None:
+            self.learner.replay.load(self.folder.replay)
+        self._resumed = checkpoint.tensors
+
+
+def _or_nan(value: float | None) -> float:
+    return float("nan") if value is None else value

@@ -1,0 +1,247 @@
+"""Find robots and read `robot.toml` into a `RobotDescription`, refusing anything that does not fit."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Iterable, Sequence
+from functools import cache
+from itertools import combinations
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+import dora
+from dora.errors import InputError
+from dora.robot.description import Contact, Coupling, Finger, JointGroup, Posture, RobotDescription
+from dora.robot.urdf import UrdfModel, read_urdf
+
+ROBOT_FILE = "robot.toml"
+SEARCH_VARIABLE = "DORA_ROBOTS"
+"""Environment variable with further folders of robots, separated as in PATH."""
+
+Table = dict[str, Any]
+T = TypeVar("T")
+
+KEYS = {
+    "robot.toml": (
+        ("name", "urdf", "wrist_link", "palm_link", "arm", "hand", "fingers", "postures", "contact"),
+        ("coupling", "never_touch"),
+    ),
+    "joint group": (("joints", "stiffness", "damping", "armature"), ()),
+    "coupling": (("follower", "leader", "multiplier", "offset"), ()),
+    "finger": (("joints", "proximal", "medial", "distal", "tip", "pad"), ()),
+    "posture": (("arm", "hand"), ()),
+    "contact group": (("links", "friction", "restitution", "contact_offset", "rest_offset"), ()),
+}
+"""Required and optional keys of each kind of table."""
+
+
+def robot_folders() -> dict[str, Path]:
+    """Folder of every robot that can be named: the repository's or the wheel's, then DORA_ROBOTS."""
+    package = Path(dora.__file__).parent
+    own = package / "_robots"
+    extra = [Path(part) for part in os.environ.get(SEARCH_VARIABLE, "").split(os.pathsep) if part]
+    places = [own if own.is_dir() else package.parent / "robots", *extra]
+    files = [file for place in places if place.is_dir() for file in sorted(place.glob(f"*/{ROBOT_FILE}"))]
+    return {file.parent.name: file.parent for file in files}
+
+
+def available_robots() -> list[str]:
+    """Names that `load_robot` accepts, sorted."""
+    return sorted(robot_folders())
+
+
+def load_robot(name_or_folder: str | Path) -> RobotDescription:
+    """The description of a robot, by name or by the folder of its `robot.toml`; read once per process.
+
+    Raises:
+        InputError: unknown robot, missing file, or a file whose content does not fit.
+    """
+    folders = robot_folders()
+    folder = folders.get(str(name_or_folder), Path(name_or_folder))
+    if not (folder / ROBOT_FILE).is_file():
+        known = ", ".join(sorted(folders)) or "none"
+        raise InputError(f"unknown robot {str(name_or_folder)!r}; available robots: {known}.")
+    return _load(folder.resolve())
+
+
+@cache
+def _load(folder: Path) -> RobotDescription:
+    path = folder / ROBOT_FILE
+    try:
+        content = tomllib.loads(path.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not valid TOML: {error}.") from error
+    return _Reader(path, read_urdf(folder / str(content.get("urdf", "robot.urdf")))).robot(content)
+
+
+class _Reader:
+    """Turns the tables of one robot.toml into checked dataclasses; every error names the file."""
+
+    def __init__(self, path: Path, model: UrdfModel) -> None:
+        self.path, self.model = path, model
+
+    def fail(self, text: str) -> InputError:
+        return InputError(f"{self.path}: {text}")
+
+    def robot(self, content: Table) -> RobotDescription:
+        self.keys(content, "robot.toml", "the file")
+        arm, hand = self.group(content["arm"], "arm"), self.group(content["hand"], "hand")
+        twice = set(arm.names) & set(hand.names)
+        if twice:
+            raise self.fail(f"joint {min(twice)!r} is both in arm and hand; keep it in one of them.")
+        shapes = {link: shapes for link, shapes in self.model.shapes.items() if shapes}
+        return RobotDescription(
+            name=str(content["name"]),
+            folder=self.path.parent,
+            urdf=self.path.parent / content["urdf"],
+            model=self.model,
+            arm=arm,
+            hand=hand,
+            couplings=self.couplings(content.get("coupling", []), hand),
+            wrist_link=self.link(content["wrist_link"]),
+            palm_link=self.link(content["palm_link"]),
+            fingers={name: self.finger(name, row, hand) for name, row in content["fingers"].items()},
+            postures={name: self.posture(name, row, arm, hand) for name, row in content["postures"].items()},
+            shapes=shapes,
+            contacts=self.contacts(content["contact"], shapes),
+            ignored_pairs=self.pairs(content.get("never_touch", {}), shapes),
+        )
+
+    def keys(self, table: Any, kind: str, where: str) -> None:
+        if not isinstance(table, dict):
+            raise self.fail(f"{where} must be a table.")
+        required, optional = KEYS[kind]
+        for key in table:
+            if key not in required + optional:
+                raise self.fail(
+                    f"{where} has the unknown key {key!r}; known: {', '.join(required + optional)}."
+                )
+        for key in required:
+            if key not in table:
+                raise self.fail(f"{where} lacks the key {key!r}; add it.")
+
+    def link(self, name: Any) -> str:
+        if name not in self.model.links:
+            raise self.fail(f"the URDF has no link {name!r}; correct the name.")
+        return name
+
+    def numbers(self, value: Any, length: int, where: str) -> np.ndarray:
+        """A float64 array of this length; a single number stands for all."""
+        try:
+            array = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise self.fail(f"{where} must be numbers.") from error
+        if array.ndim == 0:
+            array = np.full(length, array)
+        if array.shape != (length,):
+            raise self.fail(f"{where} needs {length} numbers and has {array.size}.")
+        if not np.isfinite(array).all():
+            raise self.fail(f"{where} must be finite numbers.")
+        array.flags.writeable = False
+        return array
+
+    def names(self, names: Sequence[T], where: str) -> tuple[T, ...]:
+        if not isinstance(names, list) or len(set(names)) != len(names):
+            raise self.fail(f"{where} must be a list in which every name occurs once.")
+        return tuple(names)
+
+    def group(self, table: Table, name: str) -> JointGroup:
+        self.keys(table, "joint group", name)
+        names = self.names(table["joints"], f"{name}.joints")
+        for joint in names:
+            if joint not in self.model.joints or not self.model.joints[joint].moves:
+                raise self.fail(f"the URDF has no moving joint {joint!r}, which {name}.joints names.")
+        joints = [self.model.joints[joint] for joint in names]
+        limits = {
+            key: self.numbers([getattr(joint, key) for joint in joints], len(names), f"{name} {key}")
+            for key in ("lower", "upper", "velocity", "effort")
+        }
+        gains = {
+            key: self.numbers(table[key], len(names), f"{name}.{key}")
+            for key in ("stiffness", "damping", "armature")
+        }
+        for key in ("velocity", "effort"):
+            if (limits[key] <= 0).any():
+                raise self.fail(f"the {key} limits of {name} in the URDF must be positive.")
+        for key, values in gains.items():
+            if (values < 0).any():
+                raise self.fail(f"{name}.{key} must not be negative.")
+        return JointGroup(names=names, **limits, **gains)
+
+    def couplings(self, rows: Sequence[Table], hand: JointGroup) -> tuple[Coupling, ...]:
+        found = tuple(self.coupling(row, hand) for row in rows)
+        followers = [coupling.follower for coupling in found]
+        for coupling in found:
+            name = hand.names[coupling.follower]
+            if followers.count(coupling.follower) > 1:
+                raise self.fail(f"joint {name!r} follows two leaders; keep one coupling.")
+            if coupling.leader in followers:
+                raise self.fail(f"the leader of {name!r} follows another joint; name that one as leader.")
+        return found
+
+    def coupling(self, table: Table, hand: JointGroup) -> Coupling:
+        self.keys(table, "coupling", "a coupling")
+        for key in ("follower", "leader"):
+            if table[key] not in hand.names:
+                raise self.fail(f"the {key} {table[key]!r} of a coupling is not a joint of the hand.")
+        factors = self.numbers(
+            [table["multiplier"], table["offset"]], 2, "a coupling's multiplier and offset"
+        )
+        follower, leader = (hand.names.index(table[key]) for key in ("follower", "leader"))
+        return Coupling(follower, leader, *factors.tolist())
+
+    def finger(self, name: str, table: Table, hand: JointGroup) -> Finger:
+        self.keys(table, "finger", f"fingers.{name}")
+        joints = self.names(table["joints"], f"fingers.{name}.joints")
+        for joint in joints:
+            if joint not in hand.names:
+                raise self.fail(f"fingers.{name}: {joint!r} is not a joint of the hand.")
+        links = {key: self.link(table[key]) for key in ("proximal", "medial", "distal", "tip")}
+        return Finger(name, joints, **links, pad=self.numbers(table["pad"], 3, f"fingers.{name}.pad"))
+
+    def posture(self, name: str, table: Table, arm: JointGroup, hand: JointGroup) -> Posture:
+        self.keys(table, "posture", f"postures.{name}")
+        angles = {}
+        for key, group in (("arm", arm), ("hand", hand)):
+            angles[key] = self.numbers(table[key], len(group), f"postures.{name}.{key}")
+            outside = (angles[key] < group.lower) | (angles[key] > group.upper)
+            if outside.any():
+                joint = group.names[int(np.argmax(outside))]
+                raise self.fail(f"postures.{name} puts joint {joint!r} outside its limits.")
+        return Posture(**angles)
+
+    def contacts(self, groups: dict[str, Table], shapes: Iterable[str]) -> dict[str, Contact]:
+        found: dict[str, Contact] = {}
+        for name, table in groups.items():
+            self.keys(table, "contact group", f"contact.{name}")
+            values = {key: table[key] for key in table if key != "links"}
+            contact = Contact(*self.numbers(
+                [values[key] for key in KEYS["contact group"][0][1:]], 4, f"contact.{name}"
+            ).tolist())  # fmt: skip
+            for link in map(self.link, table["links"]):
+                if link in found:
+                    raise self.fail(f"link {link!r} is in two contact groups; keep it in one of them.")
+                found[link] = contact
+        missing = sorted(set(shapes) - set(found))
+        if missing:
+            raise self.fail(f"link {missing[0]!r} has collision shapes and is in no contact group; add it.")
+        return found
+
+    def pairs(self, table: Table, shapes: Iterable[str]) -> frozenset[tuple[str, str]]:
+        """Link pairs of `never_touch`; links joined by one joint, or by fixed joints, are added."""
+        pairs = set()
+        for link, others in table.items():
+            for other in self.names(others, f"never_touch.{link}"):
+                if link == other:
+                    raise self.fail(f"never_touch.{link} names the link itself; remove it.")
+                pairs.add((min(self.link(link), self.link(other)), max(link, other)))
+        adjacent = {frozenset((joint.parent, joint.child)) for joint in self.model.joints.values()}
+        known = sorted(shapes)
+        pairs |= {(a, b) for a, b in combinations(known, 2) if frozenset((a, b)) in adjacent}
+        stray = sorted(link for pair in pairs for link in pair if link not in known)
+        if stray:
+            raise self.fail(f"never_touch names {stray[0]!r}, which has no collision shapes; remove it.")
+        return frozenset(pairs)

@@ -1,0 +1,64 @@
+"""Collision primitives in a link's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+
+from dora.robot.rotations import quaternion_apply
+
+MERGE_TOLERANCE = 1e-6
+"""Largest difference (m) between a cylinder's end and a sphere that makes them one capsule."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One primitive: centre `position` (m) and `quaternion` (wxyz) in the link frame, and `size` (m).
+
+    `size` is (half x, half y, half z) of a box, (radius,) of a sphere, (radius, half length) of a cylinder
+    or capsule. The axis of the last two is local x, as in PhysX; a capsule's half length excludes its caps.
+    """
+
+    kind: Literal["box", "sphere", "cylinder", "capsule"]
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+    size: tuple[float, ...]
+
+    @property
+    def segment(self) -> np.ndarray:
+        """End points (2, 3) of the axis of a cylinder or capsule, in the link frame (m)."""
+        if len(self.size) != 2:
+            raise ValueError(f"a {self.kind} has no axis")
+        half = torch.tensor([self.size[1], 0.0, 0.0], dtype=torch.float64)
+        reach = quaternion_apply(torch.tensor(self.quaternion, dtype=torch.float64), half).numpy()
+        return np.stack([self.position - reach, self.position + reach])
+
+
+def merge_capsules(shapes: Sequence[Shape]) -> tuple[Shape, ...]:
+    """Replace every cylinder with equal spheres at both ends by one capsule; other shapes stay.
+
+    Standard URDF has no capsule, so this is how a capsule is written there.
+    """
+    spheres = [shape for shape in shapes if shape.kind == "sphere"]
+    merged = []
+    for shape in shapes:
+        ends = shape.segment if shape.kind == "cylinder" else ()
+        caps = [cap for end in ends if (cap := _cap(spheres, end, shape.size[0])) is not None]
+        if len(caps) == 2:
+            merged.append(Shape("capsule", shape.position, shape.quaternion, shape.size))
+            spheres = [sphere for sphere in spheres if all(sphere is not cap for cap in caps)]
+        elif shape.kind != "sphere":
+            merged.append(shape)
+    return (*merged, *spheres)
+
+
+def _cap(spheres: Sequence[Shape], center: np.ndarray, radius: float) -> Shape | None:
+    """The sphere of this radius at this place, if there is one."""
+    for sphere in spheres:
+        if np.allclose((*sphere.position, *sphere.size), (*center, radius), rtol=0.0, atol=MERGE_TOLERANCE):
+            return sphere
+    return None

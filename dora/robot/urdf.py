@@ -1,0 +1,187 @@
+"""Read the parts of a URDF that Dora needs: the tree, the joints and the collision primitives."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from dora.errors import InputError
+from dora.robot.rotations import matrix_from_quaternion, quaternion_from_rpy, quaternion_multiply
+from dora.robot.shapes import Shape, merge_capsules
+
+MOVING = ("revolute", "prismatic", "continuous")
+Z_TO_X = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)
+"""Turns local x (the axis of a `Shape`) into z (the axis of a URDF cylinder); quaternion wxyz."""
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfJoint:
+    """One joint: `origin` is the (4, 4) pose of the joint frame in the parent link; limits in SI units."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: np.ndarray
+    axis: np.ndarray
+    lower: float
+    upper: float
+    velocity: float
+    effort: float
+
+    @property
+    def moves(self) -> bool:
+        """Whether the joint has a degree of freedom."""
+        return self.kind in MOVING
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfModel:
+    """The tree of a URDF: link names, joints by name, and collision shapes by link (capsules merged)."""
+
+    root: str
+    links: tuple[str, ...]
+    joints: dict[str, UrdfJoint]
+    shapes: dict[str, tuple[Shape, ...]]
+
+    def chain(self, tip: str) -> tuple[UrdfJoint, ...]:
+        """Joints from the root link to the link `tip`, in that order, fixed ones included."""
+        above = {joint.child: joint for joint in self.joints.values()}
+        found = []
+        while tip in above:
+            found.append(above[tip])
+            tip = above[tip].parent
+        return tuple(reversed(found))
+
+
+def read_urdf(path: Path) -> UrdfModel:
+    """Read a URDF file.
+
+    Raises:
+        InputError: no such file, not XML, an element the tree needs is missing, a name is used twice, a
+            lower limit exceeds its upper limit, or the links do not form one tree.
+    """
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; name the URDF file in robot.toml.")
+    try:
+        robot = ElementTree.fromstring(path.read_bytes())
+        joints = [_joint(element) for element in robot.findall("joint")]
+        links = [_text(element, "name") for element in robot.findall("link")]
+        shapes = {
+            _text(link, "name"): merge_capsules([_shape(element) for element in link.findall("collision")])
+            for link in robot.findall("link")
+        }
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"{path} is not a URDF that Dora can read: {error}.") from error
+    _check_tree(path, links, joints)
+    root = next(iter(set(links) - {joint.child for joint in joints}))
+    return UrdfModel(root, tuple(links), {joint.name: joint for joint in joints}, shapes)
+
+
+def _check_tree(path: Path, links: list[str], joints: list[UrdfJoint]) -> None:
+    for kind, names in (("link", links), ("joint", [joint.name for joint in joints])):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise InputError(f"{path} has two {kind}s named {twice[0]!r}; give each its own name.")
+    known, children = set(links), [joint.child for joint in joints]
+    for joint in joints:
+        for link in (joint.parent, joint.child):
+            if link not in known:
+                raise InputError(f"{path}: joint {joint.name!r} names the link {link!r}, which is missing.")
+        if joint.lower > joint.upper:
+            raise InputError(f"{path}: joint {joint.name!r} has its lower limit above its upper limit.")
+        if not np.isfinite([joint.lower, joint.upper, joint.velocity, joint.effort]).all() and joint.moves:
+            raise InputError(f"{path}: joint {joint.name!r} needs finite limits, velocity and effort.")
+    if len(set(children)) != len(children) or len(known - set(children)) != 1:
+        raise InputError(f"{path}: the links must form one tree with a single root.")
+
+
+def _joint(element: ElementTree.Element) -> UrdfJoint:
+    kind, name = _text(element, "type"), _text(element, "name")
+    limit, axis = element.find("limit"), element.find("axis")
+    if kind in MOVING and limit is None:
+        raise ValueError(f"joint {name!r} has no <limit>")
+    values = {} if limit is None else limit.attrib
+    return UrdfJoint(
+        name=name,
+        kind=kind,
+        parent=_text(_child(element, "parent"), "link"),
+        child=_text(_child(element, "child"), "link"),
+        origin=_pose_matrix(*_origin(element)),
+        axis=np.array([1.0, 0.0, 0.0] if axis is None else _floats(axis, "xyz")),
+        lower=float(values.get("lower", 0.0)),
+        upper=float(values.get("upper", 0.0)),
+        velocity=float(values.get("velocity", 0.0)),
+        effort=float(values.get("effort", 0.0)),
+    )
+
+
+def _shape(collision: ElementTree.Element) -> Shape:
+    geometry = next(iter(_child(collision, "geometry")))
+    if geometry.tag not in _SIZES:
+        raise ValueError(f"collision geometry <{geometry.tag}> is not a box, sphere or cylinder")
+    kind, size = _SIZES[geometry.tag](geometry)
+    position, quaternion = _origin(collision)
+    if kind == "cylinder":
+        quaternion = _compose(quaternion, Z_TO_X)
+    return Shape(kind, position, quaternion, size)
+
+
+_SIZES: dict[
+    str, Callable[[ElementTree.Element], tuple[Literal["box", "sphere", "cylinder"], tuple[float, ...]]]
+] = {
+    "box": lambda e: ("box", tuple(v / 2 for v in _floats(e, "size"))),
+    "sphere": lambda e: ("sphere", (float(_text(e, "radius")),)),
+    "cylinder": lambda e: ("cylinder", (float(_text(e, "radius")), float(_text(e, "length")) / 2)),
+}
+
+
+def _origin(
+    element: ElementTree.Element,
+) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+    """Position (m) and quaternion (wxyz) of an element's <origin>, the identity when it has none."""
+    origin = element.find("origin")
+    xyz = (0.0, 0.0, 0.0) if origin is None or "xyz" not in origin.attrib else _floats(origin, "xyz")
+    rpy = (0.0, 0.0, 0.0) if origin is None or "rpy" not in origin.attrib else _floats(origin, "rpy")
+    return (xyz[0], xyz[1], xyz[2]), quaternion_from_rpy(*rpy)
+
+
+def _pose_matrix(position: tuple[float, ...], quaternion: tuple[float, ...]) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = matrix_from_quaternion(torch.tensor(quaternion, dtype=torch.float64)).numpy()
+    pose[:3, 3] = position
+    return pose
+
+
+def _compose(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float, float]:
+    w, x, y, z = quaternion_multiply(
+        torch.tensor(a, dtype=torch.float64), torch.tensor(b, dtype=torch.float64)
+    ).tolist()
+    return w, x, y, z
+
+
+def _child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
+    child = element.find(tag)
+    if child is None:
+        raise ValueError(f"<{element.tag} name={element.get('name')!r}> has no <{tag}>")
+    return child
+
+
+def _text(element: ElementTree.Element, attribute: str) -> str:
+    if attribute not in element.attrib:
+        raise ValueError(f"a <{element.tag}> has no attribute {attribute!r}")
+    return element.attrib[attribute]
+
+
+def _floats(element: ElementTree.Element, attribute: str) -> tuple[float, ...]:
+    values = tuple(float(word) for word in _text(element, attribute).split())
+    if len(values) != 3:
+        raise ValueError(f"attribute {attribute!r} of a <{element.tag}> needs three numbers")
+    return values

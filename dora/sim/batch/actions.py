@@ -1,0 +1,60 @@
+"""Refuses actions that make no sense before anything in the simulator is touched."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from dora.errors import InputError
+
+
+def check_action(env: Any, action: Any) -> None:
+    """Check an action for `BaseEnv.step`.
+
+    Args:
+        env: an unwrapped ManiSkill environment on `physx_cpu_batch`.
+        action: None, an array (environments, dimension), or a dictionary of those by robot, or a dictionary with
+            ``control_mode`` and ``action``. One environment may leave the batch axis out.
+
+    Raises:
+        InputError: if a shape or a robot's name does not fit or a number is not finite.
+    """
+    if isinstance(action, Mapping) and "control_mode" in action:
+        if action["control_mode"] == env.agent.control_mode:
+            _check_array(action.get("action"), env._orig_single_action_space, env.num_envs, "")
+        else:
+            _check_finite(action.get("action"), "")
+    elif isinstance(action, Mapping):
+        _check_robots(env, action)
+    elif isinstance(action, np.ndarray | torch.Tensor):
+        _check_array(action, env._orig_single_action_space, env.num_envs, "")
+
+
+def _check_robots(env: Any, action: Mapping[str, Any]) -> None:
+    space = env._orig_single_action_space
+    if not isinstance(space, spaces.Dict):
+        raise InputError(
+            f"The action is a dictionary but there is one robot only: pass an array of shape "
+            f"({env.num_envs}, {space.shape[0]})."
+        )
+    if action.keys() != space.spaces.keys():
+        raise InputError(f"The action has keys {sorted(action)} but the robots are {sorted(space.spaces)}.")
+    for name, part in action.items():
+        _check_array(part, space[name], env.num_envs, f" of {name}")
+
+
+def _check_array(action: Any, space: Any, environments: int, whose: str) -> None:
+    if isinstance(space, spaces.Dict):
+        raise InputError(f"There are several robots: pass a dictionary of actions for {sorted(space.spaces)}.")
+    shape, single = tuple(np.shape(action)), tuple(space.shape)
+    if shape != (environments, *single) and not (environments == 1 and shape == single):
+        raise InputError(f"The action{whose} has shape {shape} but {(environments, *single)} is needed.")
+    _check_finite(action, whose)
+
+
+def _check_finite(action: Any, whose: str) -> None:
+    finite = action.isfinite() if isinstance(action, torch.Tensor) else np.isfinite(action)
+    if not finite.all():
+        raise InputError(f"The action{whose} contains NaN or infinity: all its numbers must be finite.")

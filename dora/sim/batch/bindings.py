@@ -1,0 +1,210 @@
+"""Connects each table of a batch system to SAPIEN's getters and setters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import sapien
+from sapien.physx import PhysxArticulation as Articulation
+from sapien.physx import PhysxArticulationJoint as Joint
+
+from dora.sim.batch.layout import BODY_COLUMNS, BodyRow
+from dora.sim.batch.packed import POSE_FLOATS, GetterSource, Source
+from dora.sim.batch.table import BlockWriter, CallWriter, Part, Table
+
+if TYPE_CHECKING:
+    from dora.sim.batch.system import BatchSystem
+
+POSE = slice(0, POSE_FLOATS)
+LINEAR = slice(POSE_FLOATS, POSE_FLOATS + 3)
+ANGULAR = slice(POSE_FLOATS + 3, BODY_COLUMNS)
+_AXES = 3
+_SPATIAL_FORCE = 6
+"""Components of an incoming joint force: force [N] and torque [N m]."""
+
+Located = tuple[Source, np.ndarray]
+Setter = Callable[[np.ndarray], None]
+
+
+def make_tables(system: BatchSystem) -> dict[str, Table]:
+    """All tables of a system by the names that `PhysxGpuSystem` gives them.
+
+    Rows of ``cuda_rigid_body_*`` are bodies, all others articulations; columns beyond an articulation's degrees of
+    freedom read as 0 and ignore writes. Forces and torques act in the next physics step and cannot be read.
+    """
+    links = (len(system.layout.articulations), system.layout.max_links, _SPATIAL_FORCE)
+    return {
+        "cuda_rigid_body_data": _body_table(system),
+        "cuda_rigid_body_force": _push_table(system, _push),
+        "cuda_rigid_body_torque": _push_table(system, _twist),
+        "cuda_articulation_qpos": _packed_joint_table(system, "qpos", Articulation.set_qpos),
+        "cuda_articulation_qvel": _packed_joint_table(system, "qvel", Articulation.set_qvel),
+        "cuda_articulation_qacc": _joint_table(system, Articulation.get_qacc, Articulation.set_qacc),
+        "cuda_articulation_qf": _joint_table(system, Articulation.get_qf, Articulation.set_qf),
+        "cuda_articulation_target_qpos": _target_table(system, "target_qpos", Joint.set_drive_target),
+        "cuda_articulation_target_qvel": _target_table(system, "target_qvel", Joint.set_drive_velocity_target),
+        "cuda_articulation_link_incoming_joint_forces": Table(
+            links,
+            _getter_planner(system, Articulation.get_link_incoming_joint_forces, links[1:]),
+            _refuse,
+            system.refresh,
+        ),
+    }
+
+
+def _refuse(*_: Any) -> Any:
+    raise TypeError("this table can be either read or written, not both: see dora.sim.batch.bindings")
+
+
+# ---- rigid bodies --------------------------------------------------------------------------------------------------
+
+
+def _body_table(system: BatchSystem) -> Table:
+    rows = system.layout.bodies
+    blocks = (
+        (POSE, [_pose_setter(row) for row in rows]),
+        (LINEAR, [_velocity_setter(row, "linear") for row in rows]),
+        (ANGULAR, [_velocity_setter(row, "angular") for row in rows]),
+    )
+    shape = (len(rows), BODY_COLUMNS)
+    plan = partial(_plan_bodies, system)
+    writer = BlockWriter(BODY_COLUMNS, blocks, lambda elements: table.read(elements), system.writing_bodies)
+    table = Table(shape, plan, writer, system.refresh)
+    return table
+
+
+def _plan_bodies(system: BatchSystem, elements: np.ndarray) -> list[Part]:
+    """Poses and actors' velocities come from the packed state, links' velocities from their getters."""
+    is_pose = elements % BODY_COLUMNS < POSE_FLOATS
+    is_link = elements // BODY_COLUMNS >= system.layout.actor_rows
+    choices = (
+        (is_pose, _locate_poses),
+        (~is_pose & ~is_link, _locate_actor_velocities),
+        (~is_pose & is_link, _locate_link_velocities),
+    )
+    parts = []
+    for chosen, locate in choices:
+        if chosen.all():
+            return [Part(*locate(system, elements))]
+        if chosen.any():
+            parts.append(Part(*locate(system, elements[chosen]), where=np.flatnonzero(chosen)))
+    return parts
+
+
+def _locate_poses(system: BatchSystem, elements: np.ndarray) -> Located:
+    rows, columns = np.divmod(elements, BODY_COLUMNS)
+    return system.poses, system.pose_index[rows, columns]
+
+
+def _locate_actor_velocities(system: BatchSystem, elements: np.ndarray) -> Located:
+    rows, columns = np.divmod(elements, BODY_COLUMNS)
+    return system.state, system.state_index.velocity[rows, columns - POSE_FLOATS]
+
+
+def _locate_link_velocities(system: BatchSystem, elements: np.ndarray) -> Located:
+    rows, columns = np.divmod(elements, BODY_COLUMNS)
+    kind, axis = np.divmod(columns - POSE_FLOATS, _AXES)
+    vectors, vector_of = np.unique(rows * 2 + kind, return_inverse=True)
+    bodies = system.layout.bodies
+    getters = [
+        bodies[vector // 2].body.get_angular_velocity
+        if vector % 2
+        else bodies[vector // 2].body.get_linear_velocity
+        for vector in vectors.tolist()
+    ]
+    return GetterSource(getters, system.epoch), vector_of.reshape(elements.shape) * _AXES + axis
+
+
+def _pose_setter(row: BodyRow) -> Setter:
+    """A link's pose is set through the link, as ManiSkill does: for a root it moves the articulation."""
+    return partial(_set_pose, row.body if row.is_link else row.entity)
+
+
+def _set_pose(target: Any, pose: np.ndarray) -> None:
+    target.set_pose(sapien.Pose(pose[:_AXES], pose[_AXES:]))
+
+
+def _velocity_setter(row: BodyRow, kind: str) -> Setter | None:
+    """Setter of a velocity; None for kinematic bodies and links other than roots, which have none of their own."""
+    if not row.is_link:
+        return None if row.body.kinematic else getattr(row.body, f"set_{kind}_velocity")
+    return getattr(row.body.articulation, f"set_root_{kind}_velocity") if row.body.is_root else None
+
+
+def _push_table(system: BatchSystem, push: Callable[[Any, np.ndarray], None]) -> Table:
+    bodies = system.layout.bodies
+    block = (slice(0, _AXES), [partial(push, row.body) for row in bodies])
+    writer = BlockWriter(_AXES, (block,), _refuse, system.writing_bodies)
+    return Table((len(bodies), _AXES), _refuse, writer, system.refresh)
+
+
+def _push(body: Any, force: np.ndarray) -> None:
+    body.add_force_at_point(force, (body.pose * body.cmass_local_pose).p)
+
+
+def _twist(body: Any, torque: np.ndarray) -> None:
+    body.add_force_torque(np.zeros(_AXES, np.float32), torque)
+
+
+# ---- articulations -------------------------------------------------------------------------------------------------
+
+
+def _joint_writer(system: BatchSystem, setter: Callable, read: Callable[[np.ndarray], np.ndarray]) -> BlockWriter:
+    layout = system.layout
+    setters = [partial(_set_joints, setter, row.articulation, row.dof) for row in layout.articulations]
+    return BlockWriter(
+        layout.max_dof, ((slice(0, layout.max_dof), setters),), read, system.writing_articulations
+    )
+
+
+def _set_joints(setter: Callable, articulation: Articulation, dof: int, values: np.ndarray) -> None:
+    setter(articulation, values[:dof])
+
+
+def _packed_joint_table(system: BatchSystem, quantity: str, setter: Callable) -> Table:
+    shape = (len(system.layout.articulations), system.layout.max_dof)
+    writer = _joint_writer(system, setter, lambda elements: table.read(elements))
+    table = Table(shape, _state_planner(system, quantity), writer, system.refresh)
+    return table
+
+
+def _joint_table(system: BatchSystem, getter: Callable, setter: Callable) -> Table:
+    shape = (len(system.layout.articulations), system.layout.max_dof)
+    writer = _joint_writer(system, setter, lambda elements: table.read(elements))
+    table = Table(shape, _getter_planner(system, getter, shape[1:]), writer, system.refresh)
+    return table
+
+
+def _target_table(system: BatchSystem, quantity: str, setter: Callable) -> Table:
+    layout = system.layout
+    setters: list[Callable[[float], None] | None] = []
+    for row in layout.articulations:
+        setters += [partial(setter, joint) for joint in row.joints]
+        setters += [None] * (layout.max_dof - row.dof)
+    writer = CallWriter(layout.max_dof, setters, system.writing_targets)
+    shape = (len(layout.articulations), layout.max_dof)
+    return Table(shape, _state_planner(system, quantity), writer, system.refresh_targets)
+
+
+def _state_planner(system: BatchSystem, quantity: str) -> Callable[[np.ndarray], Sequence[Part]]:
+    def plan(elements: np.ndarray) -> list[Part]:
+        return [Part(system.state, getattr(system.state_index, quantity).ravel()[elements])]
+
+    return plan
+
+
+def _getter_planner(
+    system: BatchSystem, getter: Callable[[Articulation], np.ndarray], row_shape: tuple[int, ...]
+) -> Callable[[np.ndarray], Sequence[Part]]:
+    """Plan for a quantity that has a getter per articulation, whose result may be shorter than a row."""
+    rows = system.layout.articulations
+    lengths = [getter(row.articulation).size for row in rows]
+    width = int(np.prod(row_shape))
+    index = np.full((len(rows), width), sum(lengths), np.int64)
+    for row, (length, start) in enumerate(zip(lengths, np.cumsum([0, *lengths]).tolist(), strict=False)):
+        index[row, :length] = np.arange(start, start + length)
+    source = GetterSource([partial(getter, row.articulation) for row in rows], system.epoch)
+    return lambda elements: [Part(source, index.ravel()[elements])]

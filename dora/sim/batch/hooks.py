@@ -1,0 +1,223 @@
+"""What has to change in ManiSkill so that it accepts the back end: a handful of functions, wrapped once.
+
+Every wrapper passes on to ManiSkill's own code unless the environment at hand runs on ``physx_cpu_batch``.
+"""
+
+from collections.abc import Callable
+from functools import cached_property, wraps
+from importlib.metadata import version
+from typing import Any
+
+import mani_skill.envs.sapien_env as sapien_env
+import numpy as np
+import sapien
+import torch
+from mani_skill import logger
+from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
+from mani_skill.agents.controllers.utils.kinematics import Kinematics
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.system.backend import BackendInfo
+from mani_skill.utils.structs import Articulation, ArticulationJoint
+from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
+from sapien import physx
+
+from dora.errors import InputError
+from dora.sim.batch.actions import check_action
+from dora.sim.batch.scene import BatchScene
+from dora.sim.rendering import can_render
+
+BACKEND = "physx_cpu_batch"
+SUPPORTED = {"mani_skill": "3.0.1", "sapien": "3.0.3"}
+"""Versions whose internals the wrappers fit."""
+STATE_MODES = ("state", "state_dict", "none")
+"""Observation modes that need no renderer."""
+
+_installed = False
+
+
+def install() -> None:
+    """Make ``sim_backend="physx_cpu_batch"`` known to ManiSkill. Calling it again does nothing.
+
+    Raises:
+        InputError: if another version of ManiSkill or SAPIEN is installed than those in ``SUPPORTED``.
+    """
+    global _installed
+    if _installed:
+        return
+    for package, needed in SUPPORTED.items():
+        if (found := version(package)) != needed:
+            raise InputError(
+                f"dora.sim needs {package} {needed} but found {found}: run pip install {package}=={needed}."
+            )
+    for owner, name, wrapper in (
+        (sapien_env, "parse_sim_and_render_backend", _parse_backends),
+        (BaseEnv, "__init__", _init),
+        (BaseEnv, "_setup_scene", _setup_scene),
+        (BaseEnv, "_step_action", _step_action),
+        (Articulation, "get_collision_meshes", _get_meshes),
+        (Articulation, "get_visual_meshes", _get_meshes),
+        (PDEEPosController, "set_action", _set_pose_action),
+        (Kinematics, "compute_ik", _compute_ik),
+    ):
+        original = getattr(owner, name)
+        setattr(owner, name, wraps(original)(wrapper(original)))
+    for owner, name, rows in (
+        (PhysxRigidBodyComponentStruct, "_body_data_index", _body_rows),
+        (Articulation, "_data_index", _articulation_rows),
+        (ArticulationJoint, "_data_index", _joint_rows),
+    ):
+        _replace_cached_property(owner, name, rows)
+    _installed = True
+
+
+def runs_batched(env: Any) -> bool:
+    """Whether a ManiSkill environment (perhaps wrapped) runs on this back end."""
+    return env.unwrapped.backend.sim_backend == BACKEND
+
+
+# ---- environments --------------------------------------------------------------------------------------------------
+
+
+def _parse_backends(original: Callable) -> Callable:
+    def parse(sim_backend: str, render_backend: str | None) -> BackendInfo:
+        if sim_backend != BACKEND:
+            return original(sim_backend, render_backend)
+        info = original("physx_cpu", render_backend or "none")
+        info.sim_backend = BACKEND
+        if not can_render():
+            info.render_device, info.render_backend = None, "none"
+        return info
+
+    return parse
+
+
+def _init(original: Callable) -> Callable:
+    def init(self: BaseEnv, num_envs: int = 1, *args: Any, **kwargs: Any) -> None:
+        if kwargs.get("sim_backend") == BACKEND:
+            if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+                raise InputError(f"num_envs is {num_envs!r}: it must be a whole number of at least 1.")
+            if kwargs.get("parallel_in_single_scene"):
+                raise InputError(f"parallel_in_single_scene is not available on {BACKEND}: leave it out.")
+        original(self, num_envs, *args, **kwargs)
+
+    return init
+
+
+def _setup_scene(original: Callable) -> Callable:
+    def setup_scene(self: BaseEnv) -> None:
+        if not runs_batched(self):
+            return original(self)
+        renderers = [] if self._render_device is None else [self._render_device]
+        if not renderers and self._obs_mode not in STATE_MODES:
+            raise InputError(
+                f"obs_mode {self._obs_mode!r} needs a renderer and there is none: install a Vulkan driver, "
+                f"such as Mesa's, and leave render_backend alone, or choose one of {', '.join(STATE_MODES)}."
+            )
+        if not renderers and self.render_mode is not None:
+            logger.warning(f"render_mode {self.render_mode!r} has no effect because there is no renderer.")
+        self._set_scene_config()
+        scenes = [
+            sapien.Scene([physx.PhysxCpuSystem(), *(sapien.render.RenderSystem(device) for device in renderers)])
+            for _ in range(self.num_envs)
+        ]
+        self.scene = BatchScene(scenes, sim_config=self.sim_config, device=self.device, backend=self.backend)
+        self.scene.px.timestep = 1.0 / self._sim_freq
+
+    return setup_scene
+
+
+def _step_action(original: Callable) -> Callable:
+    def step_action(self: BaseEnv, action: Any) -> Any:
+        if not runs_batched(self):
+            return original(self, action)
+        check_action(self, action)
+        hooks = ("_before_simulation_step", "_after_simulation_step")
+        watched = any(_is_overridden(self, hook) for hook in hooks)
+        system = self.scene.px
+        system.defer(1 if watched else self._sim_steps_per_control)
+        try:
+            return original(self, action)
+        finally:
+            system.defer(1)
+
+    return step_action
+
+
+def _is_overridden(env: BaseEnv, method: str) -> bool:
+    """Whether a method of BaseEnv was replaced, in the task's class or in this very object."""
+    return getattr(getattr(env, method), "__func__", None) is not getattr(BaseEnv, method)
+
+
+# ---- structs and controllers ---------------------------------------------------------------------------------------
+
+
+def _get_meshes(original: Callable) -> Callable:
+    """Tell ManiSkill that poses can be read, which it doubts until a GPU was initialised."""
+
+    def get_meshes(self: Articulation, *args: Any, **kwargs: Any) -> Any:
+        if not isinstance(self.scene, BatchScene):
+            return original(self, *args, **kwargs)
+        self.scene._gpu_sim_initialized = True
+        try:
+            return original(self, *args, **kwargs)
+        finally:
+            self.scene._gpu_sim_initialized = False
+
+    return get_meshes
+
+
+def _set_pose_action(original: Callable) -> Callable:
+    """Aim the inverse kinematics at target poses, as on a CPU; on a GPU ManiSkill hands it the deltas.
+
+    A controller with ``use_target`` does so everywhere, starting from its last target; here the start is the
+    measured pose.
+    """
+
+    def set_action(self: PDEEPosController, action: Any) -> None:
+        if not isinstance(self.scene, BatchScene) or self.config.use_target:
+            return original(self, action)
+        self._target_pose = self.ee_pose_at_base
+        self.config.use_target = True
+        try:
+            original(self, action)
+        finally:
+            self.config.use_target = False
+
+    return set_action
+
+
+def _compute_ik(original: Callable) -> Callable:
+    """Pinocchio's inverse kinematics, one environment after the other; where it fails the joints stay."""
+
+    def compute_ik(self: Kinematics, pose: Any, q0: torch.Tensor, *args: Any, **kwargs: Any) -> Any:
+        if not isinstance(self.articulation.scene, BatchScene):
+            return original(self, pose, q0, *args, **kwargs)
+        found = [original(self, pose[i], q0[i : i + 1], *args, **kwargs) for i in range(len(q0))]
+        stay = q0[:, self.active_joint_indices]
+        return torch.cat([stay[i : i + 1] if row is None else row for i, row in enumerate(found)])
+
+    return compute_ik
+
+
+def _replace_cached_property(owner: type, name: str, rows: Callable[[Any], torch.Tensor]) -> None:
+    original = owner.__dict__[name].func
+
+    @wraps(original)
+    def find(self: Any) -> torch.Tensor:
+        return rows(self) if isinstance(self.scene, BatchScene) else original(self)
+
+    replacement = cached_property(find)
+    replacement.__set_name__(owner, name)
+    setattr(owner, name, replacement)
+
+
+def _body_rows(struct: Any) -> torch.Tensor:
+    return torch.tensor(struct.scene.px.body_rows(struct._bodies))
+
+
+def _articulation_rows(struct: Any) -> torch.Tensor:
+    return torch.tensor(struct.scene.px.articulation_rows(struct._objs), dtype=torch.int32)
+
+
+def _joint_rows(struct: Any) -> torch.Tensor:
+    return torch.tensor(struct.scene.px.articulation_rows(struct._physx_articulations), dtype=torch.int32)

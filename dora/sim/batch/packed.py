@@ -1,0 +1,101 @@
+"""Simulator state of many environments as flat float32 arrays, re-read only where it went stale.
+
+SAPIEN packs a whole scene into bytes in one C++ call: `Scene.pack_poses` gives the poses of all entities and
+`PhysxCpuSystem.pack` the state of all bodies and articulations. One such call replaces dozens of getters, returns
+exact copies of the simulator's numbers and changes nothing in it.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Protocol
+
+import numpy as np
+
+POSE_FLOATS = 7
+"""Packed pose: quaternion wxyz, then position [m]."""
+RIGID_FLOATS = 13
+"""Packed rigid body or articulation root: pose, linear velocity [m/s], angular velocity [rad/s]."""
+POSE_ORDER = np.array([4, 5, 6, 0, 1, 2, 3])
+"""Where position and quaternion (ManiSkill's order) lie in a packed pose."""
+
+_FLOAT_BYTES = 4
+_ZERO = bytes(_FLOAT_BYTES)
+
+
+class Source(Protocol):
+    """Anything that has up-to-date simulator values as one flat array."""
+
+    def flat(self) -> np.ndarray:
+        """Current values, float32, read-only."""
+        ...
+
+
+class PackedSource:
+    """The packed bytes of all environments, concatenated, with one zero at the end for padding.
+
+    ``readers[i]()`` returns the bytes of environment i. `refresh` calls those that were invalidated since the last
+    call; between the two the values are those of the last `refresh`.
+    """
+
+    def __init__(self, readers: Sequence[Callable[[], bytes]]):
+        self._readers = list(readers)
+        self._chunks = [b""] * len(self._readers)
+        self._stale: set[int] = set()
+        self._all_stale = True
+        self._flat = np.zeros(1, np.float32)
+
+    def invalidate_all(self) -> None:
+        """Declare the values of every environment out of date."""
+        self._all_stale = True
+
+    def invalidate(self, environments: Iterable[int]) -> None:
+        """Declare the values of some environments out of date."""
+        self._stale.update(environments)
+
+    def refresh(self) -> bool:
+        """Read what is out of date; True if the number of values changed."""
+        if self._all_stale:
+            self._chunks = [read() for read in self._readers]
+        else:
+            for environment in self._stale:
+                self._chunks[environment] = self._readers[environment]()
+        self._all_stale = False
+        self._stale.clear()
+        size = self._flat.size
+        self._flat = np.frombuffer(b"".join((*self._chunks, _ZERO)), np.float32)
+        return self._flat.size != size
+
+    def flat(self) -> np.ndarray:
+        """Values of all environments, float32, read-only; the last element is 0."""
+        return self._flat
+
+    def starts(self) -> np.ndarray:
+        """Index of the first float of each environment in `flat`, shape (environments,)."""
+        sizes = [len(chunk) // _FLOAT_BYTES for chunk in self._chunks]
+        return np.cumsum([0, *sizes[:-1]])
+
+    @property
+    def padding(self) -> int:
+        """Index of the zero at the end of `flat`."""
+        return self._flat.size - 1
+
+
+class GetterSource:
+    """Values that no packed state has, read by one getter each; kept until ``epoch()`` changes.
+
+    ``flat`` is the concatenation of the getters' flattened results followed by one zero.
+    """
+
+    def __init__(self, getters: Sequence[Callable[[], np.ndarray]], epoch: Callable[[], int]):
+        self._getters = list(getters)
+        self._epoch = epoch
+        self._read_at = -1
+        self._flat = np.zeros(1, np.float32)
+
+    def flat(self) -> np.ndarray:
+        """Current values, float32; the last element is 0."""
+        epoch = self._epoch()
+        if epoch != self._read_at:
+            parts = [np.ravel(get()) for get in self._getters]
+            self._flat = np.concatenate([*parts, np.zeros(1, np.float32)])
+            self._read_at = epoch
+        return self._flat

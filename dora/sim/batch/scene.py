@@ -1,0 +1,100 @@
+"""A ManiSkill scene of N environments on the CPU, and pictures of them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.sensors.base_sensor import BaseSensor
+from mani_skill.utils.structs.render_camera import RenderCamera
+
+from dora.sim.batch.system import BatchSystem
+
+
+class _Picture:
+    """A stack of pictures with the interface of a `sapien.CudaArray`."""
+
+    def __init__(self, pixels: np.ndarray):
+        self._pixels = pixels
+
+    def torch(self) -> torch.Tensor:
+        """Pixels, shape (cameras, height, width, channels)."""
+        return torch.from_numpy(self._pixels)
+
+
+class CameraGroup:
+    """The same camera in several environments, with the interface of `sapien.render.RenderCameraGroup`."""
+
+    def __init__(self, cameras: Sequence[sapien.render.RenderCameraComponent]):
+        self._cameras = list(cameras)
+
+    def take_picture(self) -> None:
+        """Render all cameras, one after the other."""
+        for camera in self._cameras:
+            camera.take_picture()
+
+    def get_picture_cuda(self, name: str) -> _Picture:
+        """Pictures of the last `take_picture`; ``name`` is a texture such as ``"Color"``."""
+        return _Picture(np.stack([camera.get_picture(name) for camera in self._cameras]))
+
+
+class BatchScene(ManiSkillScene):
+    """ManiSkill's scene with one CPU sub-scene per environment and a `BatchSystem` for its physics.
+
+    ``gpu_sim_enabled`` is true, because it selects the code of ManiSkill that handles many environments.
+    ``rendered_environments`` chooses those that `render` shows (all by default): pictures are the costly part on a
+    CPU. Cameras that make observations always render all environments.
+    """
+
+    px: BatchSystem
+
+    def __init__(self, sub_scenes: list[sapien.Scene], **kwargs: Any):
+        super().__init__(sub_scenes, **kwargs)
+        self.px = BatchSystem(sub_scenes)
+        self.gpu_sim_enabled = True
+        self.rendered_environments: Sequence[int] = range(len(sub_scenes))
+
+    def _setup(self, enable_gpu: bool) -> None:
+        """Number all bodies, then place them as a scene on a CPU does."""
+        self.px.build(self.actors, self.articulations)
+        super()._setup(enable_gpu=False)
+
+    def _gpu_apply_all(self) -> None:
+        """Nothing: all writes are in the simulator already."""
+
+    def _gpu_fetch_all(self) -> None:
+        """Nothing: values are read when they are asked for."""
+
+    # ---- rendering ---------------------------------------------------------------------------------------------
+
+    def add_camera(self, *args: Any, **kwargs: Any) -> RenderCamera:
+        """Add a camera to every environment; mounted ones follow their entity as on a single CPU."""
+        self.gpu_sim_enabled = False
+        try:
+            return super().add_camera(*args, **kwargs)
+        finally:
+            self.gpu_sim_enabled = True
+            self.px.invalidate()
+
+    def update_render(self, update_sensors: bool = True, update_human_render_cameras: bool = True) -> None:
+        """Bring the renderers of the environments that are needed up to date.
+
+        Args:
+            update_sensors: pictures for observations are wanted, so all environments are needed.
+            update_human_render_cameras: pictures for people are wanted, of ``rendered_environments``.
+        """
+        self.px.sync_poses_gpu_to_cpu()
+        everyone = range(len(self.sub_scenes))
+        for i in everyone if update_sensors else self.rendered_environments:
+            self.sub_scenes[i].update_render()
+        if update_sensors:
+            self._group_cameras(self.sensors, everyone)
+        if update_human_render_cameras:
+            self._group_cameras(self.human_render_cameras, self.rendered_environments)
+
+    def _group_cameras(self, cameras: dict[str, BaseSensor], environments: Sequence[int]) -> None:
+        for name, sensor in cameras.items():
+            chosen = [sensor.camera._render_cameras[i] for i in environments]  # type: ignore[attr-defined]
+            sensor.camera.camera_group = self.camera_groups[name] = CameraGroup(chosen)  # type: ignore[attr-defined]

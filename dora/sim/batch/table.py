@@ -1,0 +1,189 @@
+"""Tables of live simulator values that look like the CUDA arrays ManiSkill's tasks read and write."""
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from math import prod
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dora.sim.batch.packed import Source
+
+_PLANS_KEPT = 1024
+"""Reading plans remembered per table. ManiSkill's structs index with the same tensors for ever, so few are needed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Where some elements of a table come from: ``source.flat()[index]``.
+
+    ``where`` are their positions in the flattened result, or None if they are all of it (``index`` then has its shape).
+    """
+
+    source: Source
+    index: np.ndarray
+    where: np.ndarray | None = None
+
+
+Planner = Callable[[np.ndarray], Sequence[Part]]
+Writer = Callable[[np.ndarray, np.ndarray], None]
+Writing = Callable[[np.ndarray], AbstractContextManager[None]]
+
+
+def assemble(parts: Sequence[Part], shape: tuple[int, ...]) -> np.ndarray:
+    """Float32 array of ``shape`` from its parts; a new array, safe to keep and to change."""
+    if len(parts) == 1 and parts[0].where is None:
+        return parts[0].source.flat().take(parts[0].index)
+    result = np.empty(prod(shape), np.float32)
+    for part in parts:
+        result[part.where] = part.source.flat().take(part.index)
+    return result.reshape(shape)
+
+
+class Table:
+    """A table of simulator values with the interface of a `sapien.CudaArray`.
+
+    ``table.torch()[key]`` reads the values of now, only those asked for, and returns a new tensor;
+    ``table.torch()[key] = value`` writes them into the simulator at once. Nothing is stored in between, so there is
+    nothing to fetch and nothing to apply.
+
+    Args:
+        shape: shape of the table; the first axis numbers bodies or articulations.
+        plan: maps element numbers (of the flattened table) to the parts they are read from.
+        write: takes element numbers and values of equal shape and sets them in the simulator.
+        refresh: called before every read, brings the sources up to date.
+    """
+
+    def __init__(self, shape: tuple[int, ...], plan: Planner, write: Writer, refresh: Callable[[], None]):
+        self._elements = torch.arange(prod(shape)).view(shape)
+        self._plan = plan
+        self._write = write
+        self._refresh = refresh
+        self._plans: dict[tuple, tuple[Any, Sequence[Part], tuple[int, ...]]] = {}
+
+    @property
+    def shape(self) -> torch.Size:
+        """Shape of the table."""
+        return self._elements.shape
+
+    def torch(self) -> "Table":
+        """The table itself: index it like a tensor."""
+        return self
+
+    def forget_plans(self) -> None:
+        """Plan all reads anew, because the sources were laid out differently."""
+        self._plans.clear()
+
+    def __getitem__(self, key: Any) -> Tensor:
+        self._refresh()
+        signature = _signature(key)
+        known = self._plans.get(signature)
+        if known is None:
+            known = self._remember(signature, key)
+        _, parts, shape = known
+        return torch.from_numpy(assemble(parts, shape))
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        elements = self._elements[key]
+        if elements.numel():
+            values = torch.as_tensor(value, dtype=torch.float32).expand(elements.shape)
+            self._write(elements.numpy(), values.numpy())
+
+    def read(self, elements: np.ndarray) -> np.ndarray:
+        """Values of the elements with these numbers, in the same shape."""
+        self._refresh()
+        return assemble(self._plan(elements), elements.shape)
+
+    def _remember(self, signature: tuple, key: Any) -> tuple[Any, Sequence[Part], tuple[int, ...]]:
+        elements = self._elements[key].numpy()
+        plan = (key, self._plan(elements), elements.shape)
+        if len(self._plans) >= _PLANS_KEPT:
+            self._plans.clear()
+        self._plans[signature] = plan
+        return plan
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if name.endswith("_"):
+            raise TypeError(f"write with table[...] = value: {name}() would change a copy")
+        return getattr(self[...], name)
+
+    @classmethod
+    def __torch_function__(cls, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        """Let torch functions take a table where they take a tensor: they get a copy of it."""
+        if function.__name__.endswith("_") and not function.__name__.endswith("__"):
+            raise TypeError(f"write with table[...] = value: {function.__name__}() would change a copy")
+        args = tuple(arg[...] if isinstance(arg, cls) else arg for arg in args)
+        kwargs = {name: arg[...] if isinstance(arg, cls) else arg for name, arg in (kwargs or {}).items()}
+        return function(*args, **kwargs)
+
+
+def _signature(key: Any) -> tuple:
+    """A hashable stand-in for an index; tensors count by identity (the plan keeps them alive)."""
+    if isinstance(key, tuple):
+        return tuple(_signature(part) for part in key)
+    if isinstance(key, slice):
+        return (key.start, key.stop, key.step)
+    if isinstance(key, int) or key is Ellipsis:
+        return (key,)
+    return ("object", id(key))
+
+
+class CallWriter:
+    """Writes each element by its own setter, for drive targets: ``setters[element](value)``; None ignores it.
+
+    ``writing(rows)`` is a context around the calls that knows what they change.
+    """
+
+    def __init__(self, width: int, setters: Sequence[Callable[[float], None] | None], writing: Writing):
+        self._width, self._setters, self._writing = width, setters, writing
+
+    def __call__(self, elements: np.ndarray, values: np.ndarray) -> None:
+        setters, numbers = self._setters, elements.ravel()
+        with self._writing(numbers // self._width):
+            for element, value in zip(numbers.tolist(), values.ravel().tolist(), strict=True):
+                setter = setters[element]
+                if setter is not None:
+                    setter(value)
+
+
+class BlockWriter:
+    """Writes the blocks of a row by their setters: ``blocks`` holds (columns, one setter or None per row).
+
+    Blocks go in the order given. A block that is written in part keeps the current values of its other columns,
+    which ``read`` returns for element numbers. ``writing(rows)`` is a context around the calls.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        blocks: Sequence[tuple[slice, Sequence[Callable | None]]],
+        read: Callable[[np.ndarray], np.ndarray],
+        writing: Writing,
+    ):
+        self._width, self._blocks = width, blocks
+        self._read, self._writing = read, writing
+
+    def __call__(self, elements: np.ndarray, values: np.ndarray) -> None:
+        written_rows, columns = np.divmod(elements.ravel(), self._width)
+        rows, row_of = np.unique(written_rows, return_inverse=True)
+        touched = np.zeros((len(rows), self._width), bool)
+        touched[row_of, columns] = True
+        new = self._current(rows, touched)
+        new[row_of, columns] = values.ravel()
+        with self._writing(rows):
+            for block, setters in self._blocks:
+                for i in np.flatnonzero(touched[:, block].any(axis=1)).tolist():
+                    setter = setters[rows[i]]
+                    if setter is not None:
+                        setter(new[i, block])
+
+    def _current(self, rows: np.ndarray, touched: np.ndarray) -> np.ndarray:
+        """Rows to overwrite; read only if some block is written in part."""
+        if any(touched[:, block].any() and not touched[:, block].all() for block, _ in self._blocks):
+            return self._read(rows[:, None] * self._width + np.arange(self._width))
+        return np.zeros(touched.shape, np.float32)

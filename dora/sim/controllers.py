@@ -1,0 +1,143 @@
+"""The default controller: wrist displacement through damped inverse kinematics, and hand joint targets.
+
+One law on every backend, in batched torch, on *commanded* joints: contact forces never leak into the command.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from jaxtyping import Float, Int
+from mani_skill.agents.controllers.base_controller import BaseController, ControllerConfig
+from torch import Tensor
+
+from dora.robot.description import RobotDescription
+from dora.robot.kinematics import SerialChain
+from dora.robot.rotations import quaternion_from_matrix
+
+WRIST_SPEED = 0.6
+"""Linear wrist speed of a full action along one axis [m/s]."""
+WRIST_SPIN = 2.0
+"""Angular wrist speed of a full action about one axis [rad/s]."""
+ARM_LEASH = 0.3
+"""Largest lead of a commanded arm joint over the measured one [rad]; stops wind-up in contact."""
+LIMIT_MARGIN = 0.01
+"""Distance that commanded arm joints keep from their limits [rad]."""
+
+
+class WristHandController(BaseController):
+    """6 wrist displacements, then hand joint targets; every action component in [-1, 1].
+
+    The first three components are a translation and the next three a rotation vector of the wrist in the robot's
+    base frame, scaled by WRIST_SPEED and WRIST_SPIN per control step. They become arm joint increments by
+    dq = J^T (J J^T + lambda^2 I)^-1 dx (the paper's J^+, damped), within joint and velocity limits. The rest maps
+    linearly onto the joint limits of the hand; targets move no faster than the joints' velocity limits.
+    """
+
+    config: "WristHandConfig"
+    sets_target_qpos = True
+    sets_target_qvel = False
+
+    def _initialize_joints(self) -> None:
+        super()._initialize_joints()
+        robot, f32 = self.config.robot, torch.float32
+        self.arm_size = len(robot.arm)
+        self.chain = SerialChain.of(robot, device=self.device)
+        self.dt = 1.0 / self._control_freq
+        self.wrist_scale = torch.tensor([WRIST_SPEED] * 3 + [WRIST_SPIN] * 3, device=self.device) * self.dt
+        self.arm_lower = torch.tensor(robot.arm.lower + LIMIT_MARGIN, dtype=f32, device=self.device)
+        self.arm_upper = torch.tensor(robot.arm.upper - LIMIT_MARGIN, dtype=f32, device=self.device)
+        self.hand_lower = torch.tensor(robot.hand.lower, dtype=f32, device=self.device)
+        self.hand_upper = torch.tensor(robot.hand.upper, dtype=f32, device=self.device)
+        self.hand_step = torch.tensor(robot.hand.velocity, dtype=f32, device=self.device) * self.dt
+        self.target: Tensor = torch.empty(0)
+
+    def _initialize_action_space(self) -> None:
+        size = 6 + self.hand_size
+        self.single_action_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
+
+    @property
+    def wrist_limits(self) -> tuple[float, float]:
+        """Translation [m] and rotation [rad] of a full action in one control step."""
+        return WRIST_SPEED * self.dt, WRIST_SPIN * self.dt
+
+    @property
+    def hand_size(self) -> int:
+        """Number of hand components in the action: all joints, or the actuated ones if coupled."""
+        return len(self.config.robot.hand_actuated if self.config.coupled else self.config.robot.hand)
+
+    def set_drive_property(self) -> None:
+        """Gains, effort limits and armature from the robot's description."""
+        robot = self.config.robot
+        for group, joints in (
+            (robot.arm, self.joints[: self.arm_size]),
+            (robot.hand, self.joints[self.arm_size :]),
+        ):
+            for i, joint in enumerate(joints):
+                joint.set_drive_properties(group.stiffness[i], group.damping[i], force_limit=group.effort[i])
+                for part in joint._objs:
+                    part.set_armature(np.array([group.armature[i]], np.float32))
+
+    def reset(self) -> None:
+        """Commands the measured posture in the environments that are being reset."""
+        q = self.qpos
+        if len(self.target) == 0:
+            self.target = q.clone()
+        mask = self.scene._reset_mask
+        self.target[mask] = q[mask]
+
+    def expand_hand(self, hand: Float[Tensor, "n h"]) -> Float[Tensor, "n 20"]:
+        """Values of the action's hand components -> values of all hand joints, followers equal to leaders."""
+        return self.config.robot.expand_hand(hand) if self.config.coupled else hand
+
+    def wrist(self) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
+        """The commanded wrist pose in the robot's base frame."""
+        position, matrix = self.chain.tip_pose(self.target[:, : self.arm_size])
+        return position, quaternion_from_matrix(matrix)
+
+    def hand_action(self, joints: Float[Tensor, "n 20"]) -> Float[Tensor, "n h"]:
+        """Hand components of the action that ask for these joint targets [rad]."""
+        middle, half = (self.hand_upper + self.hand_lower) / 2, (self.hand_upper - self.hand_lower) / 2
+        action = ((joints - middle) / half).clamp(-1, 1)
+        return self.config.robot.reduce_hand(action) if self.config.coupled else action
+
+    def set_action(self, action: Float[Tensor, "n a"]) -> None:
+        """Moves the commanded joints by one control step and sends them to the drives."""
+        action = action.clamp(-1, 1)
+        arm, hand = self.target[:, : self.arm_size], self.target[:, self.arm_size :]
+        arm = arm + self.chain.damped_step(arm, action[:, :6] * self.wrist_scale, duration=self.dt)
+        measured = self.qpos[:, : self.arm_size]
+        arm = torch.clamp(arm, measured - ARM_LEASH, measured + ARM_LEASH)
+        arm = torch.clamp(arm, self.arm_lower, self.arm_upper)
+        share = self.expand_hand(action[:, 6:]) / 2 + 0.5
+        wanted = self.hand_lower + share * (self.hand_upper - self.hand_lower)
+        hand = hand + torch.clamp(wanted - hand, -self.hand_step, self.hand_step)
+        self.target = torch.cat([arm, hand], -1)
+        self.articulation.set_joint_drive_targets(self.target, self.joints, self.active_joint_indices)
+
+    def get_state(self) -> dict[str, Tensor]:
+        """The commanded joints, arm then hand: (n, 27) [rad]."""
+        return {"target": self.target.clone()}
+
+    def set_state(self, state: dict[str, Tensor]) -> None:
+        """Restores commanded joints and drive targets of all environments."""
+        self.restore(state["target"], torch.arange(len(state["target"]), device=self.device))
+
+    def restore(self, target: Float[Tensor, "b 27"], rows: Int[Tensor, " b"]) -> None:
+        """Restores commanded joints [rad] and drive targets of the environments `rows`."""
+        if len(self.target) == 0:
+            self.target = self.qpos.clone()
+        self.target[rows] = target
+        self.articulation.set_joint_drive_targets(self.target, self.joints, self.active_joint_indices)
+        if self.scene.gpu_sim_enabled:
+            self.scene.px.gpu_apply_articulation_target_position()
+
+
+@dataclass
+class WristHandConfig(ControllerConfig):
+    """Configuration of `WristHandController`; `coupled` enforces the hand's couplings in the command."""
+
+    robot: RobotDescription
+    coupled: bool = False
+    controller_cls = WristHandController

@@ -1,0 +1,30 @@
+"""Mass and friction of an actor, environment by environment."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from mani_skill.utils.structs import Actor
+
+
+class ObjectProperties:
+    """Writes masses (with inertia in proportion) and friction of one body per environment.
+
+    Attributes:
+        nominal: masses as built [kg], one per environment.
+    """
+
+    def __init__(self, actor: Actor):
+        self.bodies = actor._bodies
+        self.nominal = [float(b.mass) for b in self.bodies]
+        self._inertia = [np.array(b.inertia) for b in self.bodies]
+        self._materials = [[s.physical_material for s in b.get_collision_shapes()] for b in self.bodies]
+
+    def apply(self, rows: Sequence[int], mass: Sequence[float], friction: Sequence[float]) -> None:
+        """Sets the bodies of the environments `rows`; `mass` [kg] and `friction` have one value per row."""
+        for row, m, f in zip(rows, mass, friction, strict=True):
+            body = self.bodies[row]
+            body.set_mass(m)
+            body.set_inertia(self._inertia[row] * (m / self.nominal[row]))
+            for material in self._materials[row]:
+                material.static_friction = f
+                material.dynamic_friction = f

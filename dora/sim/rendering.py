@@ -1,0 +1,38 @@
+"""Whether this machine can render, and what to do for tasks that insist on materials when it cannot."""
+
+from functools import cache
+from typing import Any
+
+import sapien
+from mani_skill.utils.building import _mjcf_loader
+
+
+class NoMaterial:
+    """Stands in for `sapien.render.RenderMaterial` on a machine without a Vulkan driver.
+
+    There the real class raises as soon as it is made, and ManiSkill's tasks make materials for visuals that are never
+    built. This one takes any arguments and attributes.
+    """
+
+    def __init__(self, *_: Any, **attributes: Any):
+        self.__dict__.update(attributes)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("set_"):
+            return lambda *_: None
+        raise AttributeError(name)
+
+
+@cache
+def can_render() -> bool:
+    """Whether SAPIEN finds a Vulkan driver; asked once per process, in about half a second.
+
+    If it finds none, `sapien.render.RenderMaterial` becomes `NoMaterial` from then on.
+    """
+    try:
+        # The render system must come before any material: SAPIEN binds to the device of the first it meets.
+        sapien.render.RenderSystem(sapien.Device("cpu"))
+    except RuntimeError:
+        sapien.render.RenderMaterial = _mjcf_loader.RenderMaterial = NoMaterial  # type: ignore[misc,assignment]
+        return False
+    return True

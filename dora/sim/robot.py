@@ -1,0 +1,160 @@
+"""ManiSkill robots made from robot descriptions: one agent class per folder in `robots/`."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.agents.base_agent import BaseAgent, Keyframe
+from mani_skill.agents.controllers.pd_joint_pos import (
+    PDJointPosControllerConfig,
+    PDJointPosMimicControllerConfig,
+)
+from mani_skill.agents.registration import REGISTERED_AGENTS, register_agent
+from mani_skill.utils.structs import Link
+from sapien.physx import PhysxMaterial
+from torch import Tensor
+
+from dora.errors import InputError
+from dora.robot import RobotDescription, available_robots, load_robot
+from dora.robot.kinematics import SerialChain
+from dora.robot.rotations import quaternion_from_matrix
+from dora.sim.controllers import WristHandConfig
+
+COUPLED = "_coupled"
+"""Suffix of the control modes that enforce the hand's couplings."""
+JOINT_DELTA = 0.1
+"""Full action of `pd_joint_delta_pos` [rad per control step]."""
+
+
+class DescribedRobot(BaseAgent):
+    """A ManiSkill agent whose joints, gains, collision shapes and postures come from a `RobotDescription`."""
+
+    description: ClassVar[RobotDescription]
+    fix_root_link = True
+
+    def _load_articulation(self, initial_pose: Any = None) -> None:
+        """Builds the articulation: primitives and materials of the description instead of the URDF's collisions."""
+        loader = self.scene.create_urdf_loader()
+        loader.name = self.uid if self._agent_idx is None else f"{self.uid}-agent-{self._agent_idx}"
+        loader.fix_root_link = self.fix_root_link
+        builder = loader.parse(str(self.description.urdf))["articulation_builders"][0]
+        bits = self.description.collision_bits()
+        for link in builder.link_builders:
+            link.collision_records = []
+            self._add_shapes(link)
+            link.collision_groups[2] |= bits.get(link.name, 0)
+        builder.initial_pose = initial_pose if initial_pose is not None else sapien.Pose()
+        self.robot = builder.build()
+        self.robot_link_names = [link.name for link in self.robot.get_links()]
+
+    def _add_shapes(self, link: Any) -> None:
+        contact = self.description.contacts.get(link.name)
+        for shape in self.description.shapes.get(link.name, ()):
+            material = (
+                PhysxMaterial(contact.friction, contact.friction, contact.restitution) if contact else None
+            )
+            pose = sapien.Pose(shape.position, shape.quaternion)
+            if shape.kind == "box":
+                link.add_box_collision(pose, list(shape.size), material)
+            elif shape.kind == "sphere":
+                link.add_sphere_collision(pose, shape.size[0], material)
+            elif shape.kind == "capsule":
+                link.add_capsule_collision(pose, *shape.size, material)
+            else:
+                link.add_cylinder_collision(pose, *shape.size, material)
+
+    def _after_loading_articulation(self) -> None:
+        for name, contact in self.description.contacts.items():
+            for body in self.robot.links_map[name]._bodies:
+                for shape in body.get_collision_shapes():
+                    shape.set_contact_offset(contact.contact_offset)
+                    shape.set_rest_offset(contact.rest_offset)
+
+    def _after_init(self) -> None:
+        d, links = self.description, self.robot.links_map
+        self.wrist: Link = links[d.wrist_link]
+        self.palm: Link = links[d.palm_link]
+        self.tips: list[Link] = [links[f.tip] for f in d.fingers.values()]
+        self.finger_links: list[list[Link]] = [[links[n] for n in f.links] for f in d.fingers.values()]
+        self.hand_index = [self.robot.active_joints_map[n].active_index[0].item() for n in d.hand.names]
+        self.arm_index = [self.robot.active_joints_map[n].active_index[0].item() for n in d.arm.names]
+        self.keyframes = {
+            name: Keyframe(pose=sapien.Pose(), qpos=self.qpos_of(p.arm, p.hand))
+            for name, p in d.postures.items()
+        }
+
+    def qpos_of(self, arm: np.ndarray, hand: np.ndarray) -> np.ndarray:
+        """Joint vectors (..., n_arm), (..., n_hand) -> the simulator's order (..., n_arm + n_hand) [rad]."""
+        out = np.zeros((*arm.shape[:-1], len(self.arm_index) + len(self.hand_index)), np.float32)
+        out[..., self.arm_index], out[..., self.hand_index] = arm, hand
+        return out
+
+    def posture_wrist(self, name: str) -> tuple[Tensor, Tensor]:
+        """Wrist pose (1, 3) [m], (1, 4) wxyz in the robot's base frame, in a named posture."""
+        arm = torch.tensor(self.description.postures[name].arm, dtype=torch.float32, device=self.device)
+        position, matrix = SerialChain.of(self.description, device=self.device).tip_pose(arm[None])
+        return position, quaternion_from_matrix(matrix)
+
+    @property
+    def _controller_configs(self) -> dict[str, Any]:
+        d = self.description
+        names = [*d.arm.names, *d.hand.names]
+        gains = {
+            key: [*getattr(d.arm, source), *getattr(d.hand, source)]
+            for key, source in (("stiffness", "stiffness"), ("damping", "damping"), ("force_limit", "effort"))
+        }
+        mimic = {
+            d.hand.names[c.follower]: {
+                "joint": d.hand.names[c.leader],
+                "multiplier": c.multiplier,
+                "offset": c.offset,
+            }
+            for c in d.couplings
+        }
+        position = {"lower": None, "upper": None, **gains}
+        delta = {"lower": -JOINT_DELTA, "upper": JOINT_DELTA, "use_delta": True, **gains}
+        modes: dict[str, Any] = {
+            "wrist_delta_hand_pos": WristHandConfig(names, robot=d),
+            "pd_joint_pos": PDJointPosControllerConfig(names, normalize_action=False, **position),
+            "pd_joint_delta_pos": PDJointPosControllerConfig(names, **delta),
+            f"wrist_delta_hand_pos{COUPLED}": WristHandConfig(names, robot=d, coupled=True),
+        }
+        if mimic:
+            modes[f"pd_joint_pos{COUPLED}"] = PDJointPosMimicControllerConfig(
+                names, normalize_action=False, mimic=mimic, **position
+            )
+            modes[f"pd_joint_delta_pos{COUPLED}"] = PDJointPosMimicControllerConfig(
+                names, mimic=mimic, **delta
+            )
+        return modes
+
+
+def register_robot(name: str) -> type[DescribedRobot]:
+    """The agent class of the robot `name`, registered with ManiSkill under that name.
+
+    Raises:
+        InputError: if the robot is unknown or its files do not fit together.
+    """
+    if name in REGISTERED_AGENTS:
+        cls = REGISTERED_AGENTS[name].agent_cls
+        if not issubclass(cls, DescribedRobot):
+            raise InputError(
+                f"the robot {name!r} is ManiSkill's own and has no description in robots/; rename yours"
+            )
+        return cls
+    description = load_robot(name)
+    title = "".join(part.capitalize() for part in name.split("_"))
+    members = {
+        "uid": name,
+        "description": description,
+        "urdf_path": str(description.urdf),
+        "__doc__": f"{name}: see robots/{name}/robot.toml.",
+    }
+    return register_agent()(type(title, (DescribedRobot,), members))
+
+
+def register_robots() -> None:
+    """Registers every robot that has a folder."""
+    for name in available_robots():
+        register_robot(name)

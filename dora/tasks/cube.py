@@ -1,0 +1,262 @@
+"""DoraCube-v1: grasp a cube on a table and lift it."""
+
+from math import cos, pi, sin
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs import Actor, Pose
+from torch import Tensor
+
+from dora.affordance.candidates import GraspCandidates
+from dora.robot.rotations import quaternion_apply, quaternion_multiply
+from dora.tasks.base import DoraEnv
+from dora.tasks.observations import Entry
+from dora.tasks.rewards import Term, Terms, closeness
+from dora.tasks.snapshot import Snapshot, goal_error, in_wrist, lifted, opposed, tips_in_object
+from dora.tasks.stages import Stage
+
+HALF = 0.03
+"""Nominal half edge of the cube [m]."""
+MASS = 0.12
+"""Nominal mass of the cube [kg]."""
+CENTRE = (0.55, 0.0)
+"""Middle of the area where the cube starts [m]."""
+SPREAD = 0.08
+"""Half width of that area [m]."""
+LIFT = 0.10
+"""Rise that counts as lifted [m]."""
+NEAR = 0.03
+"""Distance of thumb and one more fingertip from the cube's surface that ends the reach [m]."""
+TIP_RADIUS = 0.011
+"""Radius of a fingertip [m]."""
+HOLD = 10
+"""Control steps the lifted cube must be held."""
+DEEPEST = 0.003
+"""Penetration above which an episode does not count as a success [m]."""
+HAND_CENTRE = (0.041, 0.006, 0.153)
+"""Where a grasped cube's centre lies in the hand frame [m]."""
+ALPHA = 4.0
+"""Spatial sensitivity of the affordance reward [1/m]."""
+
+
+def surface_distance(s: Snapshot) -> Tensor:
+    """(n, 5) distance of each fingertip's surface from the cube's [m], negative inside (box SDF)."""
+    outside = tips_in_object(s).abs() - s.object_half[:, None]
+    sdf = outside.clamp(min=0).norm(dim=-1) + outside.amax(-1).clamp(max=0)
+    return sdf - TIP_RADIUS
+
+
+def _reach(s: Snapshot) -> Tensor:
+    d = surface_distance(s).clamp(min=0)
+    return torch.maximum(d[:, 0], d[:, 1:].amin(-1))
+
+
+def _rise(s: Snapshot) -> Tensor:
+    return (lifted(s) / LIFT).clamp(0, 1)
+
+
+def _held(s: Snapshot) -> Tensor:
+    return (lifted(s) > LIFT) & opposed(s) & ~s.supported
+
+
+def _away(s: Snapshot) -> Tensor:
+    centre = torch.tensor(HAND_CENTRE, device=s.object_p.device)
+    return (in_wrist(s, s.object_p) - centre).norm(dim=-1)
+
+
+STAGES: list[Stage[Snapshot]] = [
+    Stage("reach", lambda s: closeness(_reach(s), NEAR, 0.25), lambda s: _reach(s) < NEAR),
+    Stage(
+        "grasp",
+        lambda s: (s.touch[:, 0].float() + s.touch[:, 1:5].any(-1)) / 2,
+        opposed,
+        hold=3,
+        lost=lambda s: _reach(s) > 4 * NEAR,
+        back_to="reach",
+    ),
+    Stage("lift", _rise, _held, hold=HOLD, lost=lambda s: _away(s) > 0.12, back_to="reach"),
+]
+
+
+def _affordance(s: Snapshot) -> Tensor:
+    """R_affordance with the distance of every fingertip to the nearest point of the region (the cube's surface)."""
+    return torch.exp(-ALPHA * surface_distance(s).clamp(min=0).sum(-1))
+
+
+def _candidate(s: Snapshot) -> Tensor:
+    """Candidate term: 1 at the wrist pose the candidate asks for; held at 1 once the cube has left the table."""
+    shift, turn = goal_error(s)
+    near = closeness(shift.norm(dim=-1) + 0.1 * turn.norm(dim=-1), 0.01, 0.2)
+    return torch.where(lifted(s) > 0.02, torch.ones_like(near), near)
+
+
+def _grasp(s: Snapshot) -> Tensor:
+    return 0.6 * opposed(s).float() + 0.1 * s.touch[:, 1:5].sum(-1)
+
+
+def _lift(s: Snapshot) -> Tensor:
+    return _rise(s) * (0.3 + 0.7 * opposed(s).float())
+
+
+def _deep(s: Snapshot) -> Tensor:
+    return ((s.penetration - 0.0005) / DEEPEST).clamp(0, 1)
+
+
+def _effort(s: Snapshot) -> Tensor:
+    return s.action.square().mean(-1).clamp(max=1)
+
+
+def _change(s: Snapshot) -> Tensor:
+    return ((s.action - s.previous_action).square().mean(-1) / 4).clamp(max=1)
+
+
+TERMS: Terms[Snapshot] = Terms(
+    {
+        "affordance": Term(_affordance, 0.3, "affordance", True, "exp(-alpha * sum of fingertip distances)"),
+        "candidate": Term(_candidate, 0.3, "task", True, "closeness of the wrist to the candidate"),
+        "reach": Term(
+            lambda s: closeness(_reach(s), 0.0, 0.25), 0.3, doc="thumb and one finger near the cube"
+        ),
+        "grasp": Term(_grasp, 0.4, doc="contacts: thumb against a finger, and how many fingers"),
+        "lift": Term(_lift, 3.0, doc="rise, saturating at the target height"),
+        "held": Term(lambda s: _held(s).float(), 1.5, doc="lifted, opposed and off the table"),
+        "effort": Term(_effort, -0.05, "penalty", doc="mean square of the action"),
+        "change": Term(_change, -0.4, "penalty", doc="mean square of the action's change"),
+        "penetration": Term(_deep, -1.0, "penalty", doc="overlap beyond 0.5 mm"),
+    }
+)
+
+
+def _paper_affordance(s: Snapshot) -> Tensor:
+    return torch.exp(-ALPHA * (s.tip_p - s.object_p[:, None]).norm(dim=-1).sum(-1))
+
+
+PAPER_TERMS: Terms[Snapshot] = Terms(
+    {
+        "affordance": Term(
+            _paper_affordance, 1.0, "affordance", True, "exp(-alpha sum ||p_tip - p_afford||)"
+        ),
+        "grasp": Term(
+            lambda s: torch.exp((s.wrist_p - s.goal_p)[:, 2].clamp(max=0)) * (s.stage < 2),
+            1.0,
+            guided=True,
+            doc="exp(z_current - z_candidate), z clipped at the candidate",
+        ),  # fmt: skip
+        "lift": Term(
+            lambda s: torch.exp(lifted(s).clamp(0, LIFT) - LIFT) * (s.stage >= 2),
+            1.0,
+            doc="exp(z - z_0), saturating",
+        ),
+        "penalty": Term(
+            lambda s: s.action.square().mean(-1).clamp(max=1), -0.1, "penalty", doc="sum of action^2"
+        ),
+    }
+)
+
+# A short list made by hand, until the optimiser's candidates replace it: wrist pitch [rad], cube centre in the hand
+# frame [m], and finger postures (proximal, medial of the four fingers; the same of the thumb) [rad].
+HAND_MADE = (
+    {
+        "pitch": 0.82,
+        "centre": HAND_CENTRE,
+        "open": (0.18, 0.17, 0.0, 0.31),
+        "closed": (0.72, 0.25, 0.37, 0.0),
+    },
+    {
+        "pitch": 1.05,
+        "centre": (0.045, 0.006, 0.155),
+        "open": (0.18, 0.17, 0.0, 0.31),
+        "closed": (0.74, 0.25, 0.37, 0.0),
+    },
+)
+THUMB_ABDUCTION = -0.08
+"""Abduction of the thumb in the hand-made candidates [rad]."""
+SPREAD_FINGERS = (0.0, -0.0, 0.0, 0.0)
+"""Abduction of index, middle, ring and pinky [rad]."""
+
+
+def _posture(fingers: tuple[float, float, float, float]) -> list[float]:
+    proximal, medial, thumb_proximal, thumb_medial = fingers
+    thumb = [THUMB_ABDUCTION, thumb_proximal, thumb_medial, thumb_medial]
+    return thumb + [x for a in SPREAD_FINGERS for x in (a, proximal, medial, medial)]
+
+
+def hand_made_candidates() -> GraspCandidates:
+    """Two top grasps, each turned by quarter turns about the vertical: the cube looks the same after each."""
+    position, quaternion, pre, grasp = [], [], [], []
+    # With pitch 0 the fingers (hand z) point along +x and the palm (hand x) faces down.
+    level = torch.tensor([cos(pi / 4), 0.0, sin(pi / 4), 0.0])
+    for make in HAND_MADE:
+        for quarter in range(4):
+            yaw = torch.tensor([cos(quarter * pi / 4), 0.0, 0.0, sin(quarter * pi / 4)])
+            pitch = torch.tensor([cos(make["pitch"] / 2), 0.0, sin(make["pitch"] / 2), 0.0])
+            turn = quaternion_multiply(quaternion_multiply(yaw, pitch), level)
+            quaternion.append(turn)
+            position.append(-quaternion_apply(turn, torch.tensor(make["centre"])))
+            pre.append(torch.tensor(_posture(make["open"])))
+            grasp.append(torch.tensor(_posture(make["closed"])))
+    count = len(position)
+    down = torch.tensor([0.0, 0.0, -1.0]).repeat(count, 1)
+    return GraspCandidates(
+        "cube", torch.stack(position), torch.stack(quaternion), down, torch.stack(pre), torch.stack(grasp),
+        ("BodyGrasp",) * count,
+    )  # fmt: skip
+
+
+@register_env("DoraCube-v1", max_episode_steps=100)
+class CubeEnv(DoraEnv):
+    """Grasp a cube on a table with the five-fingered hand and lift it.
+
+    **Randomisations:** position within +-8 cm and any yaw; size, mass, friction and candidate error by preset.
+
+    **Stages:** reach (thumb and one fingertip within 3 cm of the cube), grasp (thumb and one more finger touch it for
+    3 steps), lift (>= 10 cm above its start, held by thumb and one more finger, off the table, for 10 steps).
+
+    **Success:** all stages done, and no overlap above 3 mm in the whole episode.
+
+    **Failure:** the cube falls off the table or is knocked more than 60 cm away.
+    """
+
+    STAGES = STAGES
+    TERMS = TERMS
+    PAPER_TERMS = PAPER_TERMS
+    EXTRA_OBSERVATIONS = {
+        "half": Entry(lambda s: s.object_half[:, :1], "m", "half edge of the cube"),
+        "surface": Entry(surface_distance, "m", "distance of each fingertip's surface from the cube's", True),
+    }
+    DRAWS = 3
+    MAX_STEPS = 100
+    DEEPEST = DEEPEST
+
+    def candidates(self) -> GraspCandidates:
+        return hand_made_candidates()
+
+    def load_object(self) -> Actor:
+        share = np.asarray(self._batched_episode_rng.uniform(size=(1,))).reshape(-1)
+        halves = HALF * (1 + self.preset.size * (2 * share - 1))
+        cubes = []
+        for i, half in enumerate(halves.tolist()):
+            builder = self.scene.create_actor_builder()
+            builder.add_box_collision(half_size=[half] * 3, density=MASS / (2 * half) ** 3)
+            if self.scene.can_render():
+                paint = sapien.render.RenderMaterial(base_color=[0.85, 0.25, 0.15, 1.0], roughness=0.5)
+                builder.add_box_visual(half_size=[half] * 3, material=paint)
+            builder.set_scene_idxs([i])
+            builder.initial_pose = sapien.Pose([*CENTRE, half])
+            cube = builder.build(f"cube-{i}")
+            self.remove_from_state_dict_registry(cube)
+            cubes.append(cube)
+        self.object_half = torch.tensor(halves, dtype=torch.float32, device=self.device)[:, None].repeat(1, 3)
+        merged = Actor.merge(cubes, "cube")
+        self.add_to_state_dict_registry(merged)
+        return merged
+
+    def place(self, env_idx: Tensor, u: Tensor) -> None:
+        half = self.object_half[env_idx, 0]
+        yaw = 2 * pi * u[:, 2]
+        x, y = (c + SPREAD * (2 * u[:, k] - 1) for k, c in enumerate(CENTRE))
+        zero = torch.zeros_like(yaw)
+        turn = torch.stack([(yaw / 2).cos(), zero, zero, (yaw / 2).sin()], -1)
+        self.target_object.set_pose(Pose.create_from_pq(torch.stack([x, y, half], -1), turn))

@@ -1,0 +1,88 @@
+"""Tables of a task, written from the code: `python -m dora.tasks.document` refreshes docs/tasks/.
+
+Each page keeps its hand-written part; what stands between the two marks is replaced.
+"""
+
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+
+from dora.tasks import make_task, task_ids
+from dora.tasks.base import DoraEnv
+
+BEGIN, END = "<!-- generated: begin -->", "<!-- generated: end -->"
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def tables(task: DoraEnv) -> str:
+    """Markdown tables of observation, action, stages, reward terms and presets of a guided task."""
+    s = task.snapshot
+    observation, start = [], 0
+    for name, entry in task.observation_entries.items():
+        size = entry.value(s).shape[-1]
+        who = "guided" if entry.guided else "both"
+        observation.append(
+            [f"{start}-{start + size - 1}", f"`{name}`", str(size), entry.unit, entry.doc, who]
+        )
+        start += size
+    stages = [
+        [f"`{x.name}`", str(x.hold), f"`{x.back_to}`" if x.back_to else "never"] for x in task.machine.stages
+    ]
+    terms = [
+        [f"`{name}`", t.part, f"{t.weight:g}", t.doc, "guided" if t.guided else "both"]
+        for name, t in task.TERMS.terms.items()
+    ]
+    limits = [
+        ["control / physics", f"{task.CONTROL_FREQUENCY} / {task.PHYSICS_FREQUENCY} Hz"],
+        ["episode", f"{task.MAX_STEPS} steps, {task.MAX_STEPS / task.CONTROL_FREQUENCY:g} s"],
+        ["solver position iterations", str(task.SOLVER_ITERATIONS)],
+        ["deepest penetration of a success", f"{task.DEEPEST * 1000:g} mm"],
+    ]
+    return "\n\n".join(
+        (
+            f"### Observation ({start} numbers with guidance)",
+            _table(["index", "entry", "size", "unit", "meaning", "exists"], observation),
+            f"### Action ({task.action_size} numbers in [-1, 1])",
+            "0-2 wrist translation, 3-5 wrist rotation, then hand joints thumb to pinky. With guidance: the correction "
+            "of the reference, in units of its bounds, in the hand frame.",
+            "### Stages",
+            _table(["stage", "steps to hold", "falls back to"], stages),
+            "### Reward terms",
+            _table(["term", "part", "weight", "meaning", "exists"], terms),
+            "### Limits",
+            _table(["what", "value"], limits),
+        )
+    )
+
+
+def refreshed(page: str, generated: str) -> str:
+    """The page with its generated part replaced; ValueError if the marks are missing."""
+    head, mark, rest = page.partition(BEGIN)
+    _, end, tail = rest.partition(END)
+    if not mark or not end:
+        raise ValueError(f"the page lacks the marks {BEGIN} and {END}")
+    return f"{head}{BEGIN}\n\n{generated}\n\n{END}{tail}"
+
+
+def page_of(env_id: str, docs: Path) -> Path:
+    """Path of the page of a Dora id: DoraCube-v1 -> docs/tasks/cube.md."""
+    return docs / "tasks" / f"{env_id.removeprefix('Dora').split('-')[0].lower()}.md"
+
+
+def main(docs: Path) -> None:
+    """Refreshes the page of every registered task."""
+    for env_id in task_ids():
+        task = make_task(env_id, 1, sim_backend="physx_cpu")
+        path = page_of(env_id, docs)
+        path.write_text(refreshed(path.read_text(), tables(task)))
+        task.close()
+        print(f"{path}: {gym.spec(env_id).id}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path("docs"))

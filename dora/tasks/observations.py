@@ -1,0 +1,92 @@
+"""The observation as a table: name, function of the snapshot, size, unit and meaning of every entry."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dora.robot.rotations import (
+    matrix_from_quaternion,
+    quaternion_apply,
+    quaternion_inverse,
+    quaternion_multiply,
+)
+from dora.tasks.guidance import PHASES
+from dora.tasks.snapshot import Snapshot, goal_error, in_wrist, lifted, turned_in_wrist
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One part of the observation.
+
+    Attributes:
+        value: snapshot -> (n, k) tensor.
+        unit: unit of the values, "1" if dimensionless.
+        doc: what it is, for the documentation table.
+        guided: True if it exists only with `guidance="affordance"`.
+    """
+
+    value: Callable[[Snapshot], Tensor]
+    unit: str
+    doc: str
+    guided: bool = False
+
+
+def _axes(q: Tensor) -> Tensor:
+    """(n, 6): first two columns of the rotation matrix, a continuous encoding of orientation."""
+    return matrix_from_quaternion(q)[..., :2].flatten(-2)
+
+
+def _tips(s: Snapshot) -> Tensor:
+    n = len(s.tip_p)
+    wrist = [s.wrist_p, s.wrist_q]
+    p, q = (x[:, None].expand(n, 5, x.shape[-1]).reshape(n * 5, -1) for x in wrist)
+    return quaternion_apply(quaternion_inverse(q), s.tip_p.reshape(n * 5, 3) - p).reshape(n, 15)
+
+
+def _tip_directions(s: Snapshot) -> Tensor:
+    return matrix_from_quaternion(s.tip_q)[..., 2].flatten(-2)
+
+
+def _object_turn(s: Snapshot) -> Tensor:
+    return _axes(quaternion_multiply(quaternion_inverse(s.wrist_q), s.object_q))
+
+
+OBSERVATIONS: dict[str, Entry] = {
+    "hand_q": Entry(lambda s: s.hand_q, "rad", "hand joint angles, thumb to pinky"),
+    "hand_v": Entry(lambda s: s.hand_v, "rad/s", "hand joint velocities"),
+    "hand_lead": Entry(lambda s: s.hand_target - s.hand_q, "rad", "commanded minus measured hand joints"),
+    "arm_q": Entry(lambda s: s.arm_q, "rad", "arm joint angles"),
+    "tips": Entry(_tips, "m", "fingertip positions in the hand frame"),
+    "tip_axes": Entry(_tip_directions, "1", "fingertip directions (tip z axes), world frame"),
+    "wrist_p": Entry(lambda s: s.wrist_p, "m", "wrist position, world frame"),
+    "wrist_R": Entry(lambda s: _axes(s.wrist_q), "1", "wrist orientation, two columns of its matrix"),
+    "wrist_v": Entry(lambda s: s.wrist_v, "m/s", "wrist linear velocity, world frame"),
+    "wrist_w": Entry(lambda s: s.wrist_w, "rad/s", "wrist angular velocity, world frame"),
+    "object_p": Entry(lambda s: in_wrist(s, s.object_p), "m", "object position in the hand frame"),
+    "object_R": Entry(_object_turn, "1", "object orientation in the hand frame, two columns of its matrix"),
+    "object_v": Entry(lambda s: turned_in_wrist(s, s.object_v), "m/s", "object velocity in the hand's axes"),
+    "object_w": Entry(lambda s: turned_in_wrist(s, s.object_w), "rad/s", "object spin in the hand's axes"),
+    "object_rise": Entry(lambda s: lifted(s)[:, None], "m", "height of the object above its start"),
+    "touch": Entry(lambda s: s.touch.float(), "1", "contact of thumb, index, middle, ring, pinky, palm"),
+    "stage": Entry(lambda s: s.stage[:, None].float(), "1", "index of the active stage"),
+    "time": Entry(lambda s: s.time[:, None], "1", "share of the episode that is over"),
+    "goal": Entry(
+        lambda s: torch.cat(goal_error(s), -1),
+        "m, rad",
+        "wrist to candidate: position and rotation vector",
+        True,
+    ),
+    "goal_hand": Entry(
+        lambda s: s.goal_grasp - s.hand_q, "rad", "candidate's closed hand minus measured joints", True
+    ),
+    "phase": Entry(
+        lambda s: F.one_hot(s.phase, len(PHASES) + 1)[:, : len(PHASES)].float(),
+        "1",
+        "phase of the reference",
+        True,
+    ),
+    "correction": Entry(lambda s: s.correction, "1", "low-passed correction, in units of the bounds", True),
+}

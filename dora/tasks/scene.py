@@ -1,0 +1,47 @@
+"""The furniture every task shares."""
+
+import sapien
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.utils.structs import Actor
+
+TABLE_CENTRE = (0.35, 0.0)
+"""Centre of the table top in the robot's base frame [m]."""
+TABLE_HALF = (0.65, 0.6, 0.02)
+"""Half extents of the table top [m]; its upper face is z = 0, where the robot stands."""
+TABLE_HEIGHT = 0.74
+"""Height of the table top above the floor [m]."""
+LEG_HALF = 0.03
+"""Half width of a table leg [m]."""
+WOOD = (0.55, 0.42, 0.30, 1.0)
+STEEL = (0.25, 0.26, 0.28, 1.0)
+FLOOR = (0.75, 0.76, 0.78, 1.0)
+FLOOR_HALF = 6.0
+"""Half width of the visible floor [m]."""
+
+
+def add_table(scene: ManiSkillScene) -> Actor:
+    """A static table whose upper face is z = 0, with legs and a floor that are only drawn."""
+    x, y = TABLE_CENTRE
+    top = sapien.Pose([x, y, -TABLE_HALF[2]])
+    builder = scene.create_actor_builder()
+    builder.add_box_collision(top, list(TABLE_HALF))
+    if scene.can_render():
+        wood, steel, floor = (
+            sapien.render.RenderMaterial(base_color=list(c), roughness=0.7, specular=0.3)
+            for c in (WOOD, STEEL, FLOOR)
+        )
+        builder.add_box_visual(top, list(TABLE_HALF), wood)
+        half = TABLE_HEIGHT / 2 - TABLE_HALF[2]
+        for sx in (-1, 1):
+            for sy in (-1, 1):
+                foot = [
+                    x + sx * (TABLE_HALF[0] - 2 * LEG_HALF),
+                    y + sy * (TABLE_HALF[1] - 2 * LEG_HALF),
+                    -2 * TABLE_HALF[2] - half,
+                ]
+                builder.add_box_visual(sapien.Pose(foot), [LEG_HALF, LEG_HALF, half], steel)
+        builder.add_box_visual(
+            sapien.Pose([x, y, -TABLE_HEIGHT - 0.01]), [FLOOR_HALF, FLOOR_HALF, 0.01], floor
+        )
+    builder.initial_pose = sapien.Pose()
+    return builder.build_static("table")

@@ -1,0 +1,108 @@
+"""What a one-arm task reads from the simulator: one frozen record per control step, world frame, SI units."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dora.robot.rotations import (
+    quaternion_apply,
+    quaternion_inverse,
+    quaternion_multiply,
+    rotation_vector_from_quaternion,
+)
+
+FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+"""Finger order of every tensor with a finger axis."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """State of n environments after a control step. Poses are (position [m], quaternion wxyz).
+
+    Attributes:
+        arm_q: arm joints [rad].
+        hand_q, hand_v: measured hand joints [rad], [rad/s].
+        hand_target: commanded hand joints [rad].
+        wrist_p, wrist_q, wrist_v, wrist_w: pose, linear [m/s] and angular velocity [rad/s] of the hand's base.
+        tip_p, tip_q: fingertip poses.
+        object_p, object_q, object_v, object_w: pose and velocities of the manipulated object.
+        object_half: half extents of the object's box, or of its bounding box [m].
+        start_p: object position at the start of the episode [m].
+        touch: contact of each finger, then the palm, with the object during the last physics step.
+        force: magnitude of those contacts' forces [N].
+        supported: the object touches the world (table, stand).
+        penetration: deepest overlap of hand and object, or of either with the world, now [m].
+        deepest: the same, maximum over the episode [m].
+        stage: index of the active stage; the number of stages when all are done.
+        time: share of the episode that is over, 0 to 1.
+        action, previous_action: last two actions, as given.
+        goal_p, goal_q: wrist pose that the chosen candidate asks for now (it follows the object).
+        goal_pregrasp, goal_grasp: hand joints of that candidate [rad].
+        phase: index of the reference's phase.
+        correction: low-passed correction of the reference, in units of the bounds.
+    """
+
+    arm_q: Float[Tensor, "n 7"]
+    hand_q: Float[Tensor, "n 20"]
+    hand_v: Float[Tensor, "n 20"]
+    hand_target: Float[Tensor, "n 20"]
+    wrist_p: Float[Tensor, "n 3"]
+    wrist_q: Float[Tensor, "n 4"]
+    wrist_v: Float[Tensor, "n 3"]
+    wrist_w: Float[Tensor, "n 3"]
+    tip_p: Float[Tensor, "n 5 3"]
+    tip_q: Float[Tensor, "n 5 4"]
+    object_p: Float[Tensor, "n 3"]
+    object_q: Float[Tensor, "n 4"]
+    object_v: Float[Tensor, "n 3"]
+    object_w: Float[Tensor, "n 3"]
+    object_half: Float[Tensor, "n 3"]
+    start_p: Float[Tensor, "n 3"]
+    touch: Bool[Tensor, "n 6"]
+    force: Float[Tensor, "n 6"]
+    supported: Bool[Tensor, " n"]
+    penetration: Float[Tensor, " n"]
+    deepest: Float[Tensor, " n"]
+    stage: Int[Tensor, " n"]
+    time: Float[Tensor, " n"]
+    action: Float[Tensor, "n a"]
+    previous_action: Float[Tensor, "n a"]
+    goal_p: Float[Tensor, "n 3"]
+    goal_q: Float[Tensor, "n 4"]
+    goal_pregrasp: Float[Tensor, "n 20"]
+    goal_grasp: Float[Tensor, "n 20"]
+    phase: Int[Tensor, " n"]
+    correction: Float[Tensor, "n a"]
+
+
+def in_wrist(s: Snapshot, point: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """World point -> hand-base frame [m]."""
+    return quaternion_apply(quaternion_inverse(s.wrist_q), point - s.wrist_p)
+
+
+def turned_in_wrist(s: Snapshot, vector: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """World direction -> hand-base frame (unit unchanged)."""
+    return quaternion_apply(quaternion_inverse(s.wrist_q), vector)
+
+
+def tips_in_object(s: Snapshot) -> Float[Tensor, "n 5 3"]:
+    """Fingertips in the object frame [m]."""
+    q = quaternion_inverse(s.object_q)[:, None].expand(-1, 5, -1)
+    return quaternion_apply(q, s.tip_p - s.object_p[:, None])
+
+
+def goal_error(s: Snapshot) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Position [m] and rotation vector [rad] from the wrist to the candidate's goal, in the hand-base frame."""
+    turn = quaternion_multiply(quaternion_inverse(s.wrist_q), s.goal_q)
+    return in_wrist(s, s.goal_p), rotation_vector_from_quaternion(turn)
+
+
+def lifted(s: Snapshot) -> Float[Tensor, " n"]:
+    """Height of the object above its start [m]."""
+    return s.object_p[:, 2] - s.start_p[:, 2]
+
+
+def opposed(s: Snapshot) -> Bool[Tensor, " n"]:
+    """The thumb and at least one more finger touch the object."""
+    return s.touch[:, 0] & s.touch[:, 1:5].any(-1)

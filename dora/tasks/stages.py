@@ -1,0 +1,100 @@
+"""Batched stage machine: every environment walks the same table of sub-tasks at its own pace."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+S = TypeVar("S")
+
+
+@dataclass(frozen=True)
+class Stage(Generic[S]):
+    """One sub-task.
+
+    Attributes:
+        name: unique, snake_case; appears in logs as `stage/<name>`.
+        progress: snapshot -> (N,) in [0, 1], how near the stage is to done.
+        done: snapshot -> (N,) bool, the stage's own success test.
+        hold: consecutive control steps `done` must stay true before the next stage starts.
+        lost: snapshot -> (N,) bool, sends the environment back to `back_to`; None if nothing can be lost.
+        back_to: name of an earlier stage.
+    """
+
+    name: str
+    progress: Callable[[S], Tensor]
+    done: Callable[[S], Tensor]
+    hold: int = 1
+    lost: Callable[[S], Tensor] | None = None
+    back_to: str | None = None
+
+
+class StageMachine(Generic[S]):
+    """Holds, per environment, the active stage (K when all K are done), the hold count and the furthest stage."""
+
+    def __init__(self, stages: Sequence[Stage[S]], num_envs: int, device: torch.device | str = "cpu"):
+        """Builds the machine; raises ValueError for repeated names or a `back_to` that is no earlier stage."""
+        names = [s.name for s in stages]
+        if len(set(names)) != len(names):
+            raise ValueError(f"stage names repeat: {names}")
+        for k, s in enumerate(stages):
+            if (s.lost is None) != (s.back_to is None):
+                raise ValueError(f"stage {s.name!r} must give both lost and back_to or neither")
+            if s.back_to is not None and s.back_to not in names[:k]:
+                raise ValueError(
+                    f"stage {s.name!r} goes back to {s.back_to!r}, which is not an earlier stage"
+                )
+        self.stages = tuple(stages)
+        self.index = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self.held = torch.zeros_like(self.index)
+        self.furthest = torch.zeros_like(self.index)
+        # Row K stands for "finished": never left, never held.
+        self._hold = torch.tensor([s.hold for s in stages] + [1], device=device)
+        self._back = torch.tensor(
+            [names.index(s.back_to) if s.back_to else 0 for s in stages] + [0], device=device
+        )
+
+    def __len__(self) -> int:
+        return len(self.stages)
+
+    def reset(self, env_idx: Tensor) -> None:
+        """Sends the environments in `env_idx` (b,) back to the first stage; the others keep theirs."""
+        for buffer in (self.index, self.held, self.furthest):
+            buffer[env_idx] = 0
+
+    def advance(self, s: S) -> None:
+        """Moves every environment at most one stage. Call exactly once per control step."""
+        no = torch.zeros_like(self.index, dtype=torch.bool)
+        done = torch.stack([x.done(s) for x in self.stages] + [no])
+        lost = torch.stack([x.lost(s) if x.lost else no for x in self.stages] + [no])
+        now = self.index[None]
+        is_done, is_lost = done.gather(0, now)[0], lost.gather(0, now)[0]
+        held = torch.where(is_done, self.held + 1, 0)
+        forward = held >= self._hold[self.index]
+        forward &= self.index < len(self)
+        step = torch.where(is_lost, self._back[self.index], self.index + forward)
+        self.held.copy_(torch.where(forward | is_lost, 0, held))
+        self.index.copy_(step)
+        self.furthest.copy_(torch.maximum(self.furthest, step))
+
+    def score(self, s: S) -> Tensor:
+        """(N,) in [0, 1]: stages finished plus progress in the active one, over K."""
+        one = torch.ones_like(self.index, dtype=torch.float32)
+        progress = torch.stack([x.progress(s) for x in self.stages] + [0 * one]).clamp(0, 1)
+        return (self.index + progress.gather(0, self.index[None])[0]) / len(self)
+
+    def get_state(self) -> dict[str, Tensor]:
+        """The machine's (N,) buffers by name."""
+        return {"stage": self.index.clone(), "held": self.held.clone(), "furthest": self.furthest.clone()}
+
+    def set_state(self, state: dict[str, Tensor], env_idx: Tensor | slice) -> None:
+        """Inverse of `get_state` for the rows `env_idx`; values may be floats, as in flattened states."""
+        for name, buffer in (("stage", self.index), ("held", self.held), ("furthest", self.furthest)):
+            buffer[env_idx] = state[name].reshape(-1).to(buffer.dtype)
+
+    @property
+    def finished(self) -> Tensor:
+        """(N,) bool: all stages done."""
+        return self.index == len(self)

@@ -1,0 +1,88 @@
+"""A point mass on a plane that has to reach a goal: the task interface without a simulator."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor
+
+STEP = 0.15  # largest displacement per step, m
+NEAR = 0.15  # distance to the goal that counts as reached, m
+
+
+class PointMass:
+    """N points; observation (N, 4) = position and goal, action (N, 2) = displacement / STEP.
+
+    Success is to be near the goal at the present step. With `deterministic` all episodes start alike.
+    """
+
+    device = torch.device("cpu")
+    stage_names = ("approach", "reach")
+    logged = (
+        "reward/distance",
+        "reward/reach",
+        "stage/approach",
+        "stage/reach",
+        "penetration_mm",
+        "action_norm",
+    )
+
+    def __init__(
+        self, num_envs: int = 8, max_steps: int = 16, deterministic: bool = False, fail_at: int = -1
+    ):
+        self.num_envs, self.max_steps, self.deterministic, self.fail_at = (
+            num_envs,
+            max_steps,
+            deterministic,
+            fail_at,
+        )
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.elapsed_steps = torch.zeros(num_envs, dtype=torch.int64)
+        self.position, self.goal = torch.zeros(num_envs, 2), torch.zeros(num_envs, 2)
+        self.generators = [np.random.default_rng(row) for row in range(num_envs)]
+        self.closed = False
+
+    def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+        options = options or {}
+        if seed is not None and "env_idx" in options:
+            raise ValueError("a seed reseeds every environment and cannot come with env_idx")
+        seeds = (
+            seed if isinstance(seed, list) else [seed + row for row in range(self.num_envs)] if seed else None
+        )
+        if seeds is not None:
+            self.generators = [np.random.default_rng(s) for s in seeds]
+        index = options.get("env_idx", torch.arange(self.num_envs))
+        draws = torch.tensor(
+            np.array([self.generators[i].uniform(-1, 1, 4) for i in index]), dtype=torch.float32
+        )
+        draws = torch.full_like(draws, 0.5) if self.deterministic else draws
+        self.position[index], self.goal[index] = draws[:, :2] * 0.2, draws[:, 2:]
+        self.elapsed_steps[index] = 0
+        return self.observe(), {}
+
+    def observe(self) -> Tensor:
+        return torch.cat([self.position, self.goal], 1)
+
+    def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        self.elapsed_steps += 1
+        self.position += STEP * action
+        distance = (self.position - self.goal).norm(dim=1)
+        near = distance < NEAR
+        terms = {"reward/distance": -distance, "reward/reach": near.float()}
+        fail = self.elapsed_steps == self.fail_at
+        info = terms | {
+            "success": near,
+            "fail": fail,
+            "stage/approach": distance < 0.5,
+            "stage/reach": near,
+            "penetration_mm": torch.zeros(self.num_envs),
+            "action_norm": action.norm(dim=1),
+        }
+        return self.observe(), terms["reward/distance"] + terms["reward/reach"], fail, fail & False, info
+
+    def render(self) -> Tensor:
+        return torch.full((1, 32, 32, 3), 128, dtype=torch.uint8)
+
+    def close(self) -> None:
+        self.closed = True

@@ -1,0 +1,144 @@
+"""The stage machine and the reward terms on invented states, without a simulator."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+
+from dora.tasks.rewards import Term, Terms, closeness
+from dora.tasks.stages import Stage, StageMachine
+
+
+@dataclass(frozen=True)
+class State:
+    distance: Tensor
+    height: Tensor
+
+
+STAGES: list[Stage[State]] = [
+    Stage("reach", lambda s: closeness(s.distance, 0.02, 0.3), lambda s: s.distance < 0.03),
+    Stage(
+        "lift",
+        lambda s: (s.height / 0.1).clamp(0, 1),
+        lambda s: s.height > 0.1,
+        hold=3,
+        lost=lambda s: s.distance > 0.08,
+        back_to="reach",
+    ),
+]
+
+
+def state(distance: list[float], height: list[float]) -> State:
+    return State(torch.tensor(distance), torch.tensor(height))
+
+
+def test_each_environment_walks_alone():
+    m = StageMachine(STAGES, 4)
+    m.advance(state([0.5, 0.01, 0.01, 0.5], [0.0] * 4))
+    assert m.index.tolist() == [0, 1, 1, 0]
+    for _ in range(2):
+        m.advance(state([0.5, 0.01, 0.2, 0.01], [0.0, 0.2, 0.2, 0.2]))
+    assert m.index.tolist() == [0, 1, 0, 1]  # 1 has held two of three steps; 2 lost it
+    m.advance(state([0.5, 0.01, 0.2, 0.01], [0.0, 0.2, 0.2, 0.2]))
+    assert m.index.tolist() == [0, 2, 0, 1]
+    assert m.finished.tolist() == [False, True, False, False]
+    m.advance(state([0.5] * 4, [0.0] * 4))
+    assert m.index[1] == 2  # finished is never left
+    assert m.furthest.tolist() == [0, 2, 1, 1]
+
+
+def test_an_interrupted_hold_starts_again():
+    m = StageMachine(STAGES, 1)
+    m.advance(state([0.01], [0.2]))
+    for height in (0.2, 0.2, 0.0, 0.2, 0.2):
+        m.advance(state([0.01], [height]))
+    assert m.index.item() == 1
+    assert m.held.item() == 2
+
+
+def test_partial_reset_touches_only_its_rows():
+    m = StageMachine(STAGES, 5)
+    m.index[:], m.held[:], m.furthest[:] = 1, 2, 1
+    m.reset(torch.tensor([1, 3]))
+    assert m.index.tolist() == [1, 0, 1, 0, 1]
+    assert m.held.tolist() == [2, 0, 2, 0, 2]
+    assert m.index.shape == (5,)
+
+
+def test_state_round_trip_by_rows():
+    m, other = StageMachine(STAGES, 3), StageMachine(STAGES, 3)
+    m.index[:], m.held[:], m.furthest[:] = torch.tensor([0, 1, 2]), 2, 2
+    rows = torch.tensor([2, 1])
+    other.set_state({k: v[rows] for k, v in m.get_state().items()}, rows)
+    assert other.index.tolist() == [0, 1, 2]
+    assert other.held.tolist() == [0, 2, 2]
+
+
+def test_batch_equals_singles():
+    torch.manual_seed(0)
+    steps, n = 40, 64
+    d, z = torch.rand(steps, n) * 0.1, torch.rand(steps, n) * 0.2
+    big, singles = StageMachine(STAGES, n), [StageMachine(STAGES, 1) for _ in range(n)]
+    for t in range(steps):
+        big.advance(State(d[t], z[t]))
+        for i, m in enumerate(singles):
+            m.advance(State(d[t, i : i + 1], z[t, i : i + 1]))
+    assert big.index.tolist() == [m.index.item() for m in singles]
+    assert len(set(big.index.tolist())) == 3
+
+
+def test_score_is_bounded_and_ordered():
+    m = StageMachine(STAGES, 3)
+    m.index[:] = torch.tensor([0, 1, 2])
+    score = m.score(state([0.3, 0.01, 0.01], [0.0, 0.05, 0.2]))
+    assert (score.diff() > 0).all()
+    assert score[0] >= 0
+    assert score[2] == 1
+
+
+def test_terms_add_up_and_know_their_bounds():
+    terms: Terms[State] = Terms(
+        {
+            "near": Term(lambda s: closeness(s.distance, 0.0, 0.1), 2.0),
+            "high": Term(lambda s: s.height, -1.0, "penalty"),
+        }
+    )
+    total, parts = terms(state([0.0, 9.0], [0.5, 1.0]))
+    assert torch.equal(total, sum(parts.values()))
+    assert total[0] == 1.5
+    assert (terms.lower, terms.upper) == (-1.0, 2.0)
+
+
+def test_guided_terms_can_be_taken_away():
+    terms: Terms[State] = Terms(
+        {"a": Term(lambda s: s.height, 1.0, "affordance", True), "b": Term(lambda s: s.height, 1.0)}
+    )
+    assert list(terms.without_guidance().terms) == ["b"]
+
+
+def test_closeness_hits_its_anchors():
+    d = torch.tensor([0.0, 0.02, 0.12])
+    torch.testing.assert_close(closeness(d, 0.02, 0.1), torch.tensor([1.0, 1.0, 0.1]))
+
+
+@pytest.mark.parametrize(("tolerance", "reach"), [(-0.1, 1.0), (0.0, 0.0)])
+def test_closeness_refuses_bad_anchors(tolerance: float, reach: float):
+    with pytest.raises(ValueError, match="tolerance"):
+        closeness(torch.zeros(1), tolerance, reach)
+
+
+def test_bad_tables_are_refused():
+    def value(s: State) -> Tensor:
+        return s.height
+
+    with pytest.raises(ValueError, match="repeat"):
+        StageMachine([Stage("a", value, value), Stage("a", value, value)], 1)
+    with pytest.raises(ValueError, match="not an earlier stage"):
+        StageMachine([Stage("a", value, value, lost=value, back_to="b"), Stage("b", value, value)], 1)
+    with pytest.raises(ValueError, match="both lost and back_to"):
+        StageMachine([Stage("a", value, value, lost=value)], 1)
+    with pytest.raises(ValueError, match="at least one term"):
+        Terms({})
+    with pytest.raises(ValueError, match="penalty"):
+        Terms({"a": Term(value, 1.0, "penalty")})
