@@ -18,8 +18,8 @@ class PointMass:
     """
 
     device = torch.device("cpu")
-    stage_names = ("approach", "reach")
-    logged = (
+    stage_names: tuple[str, ...] = ("approach", "reach")
+    logged: tuple[str, ...] = (
         "reward/distance",
         "reward/reach",
         "stage/approach",

@@ -1,5 +1,8 @@
 """Arm kinematics against the DH table, two other libraries and finite differences; damped steps."""
 
+# Pinocchio and Coal are compiled modules without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 import logging
 import math
 from pathlib import Path

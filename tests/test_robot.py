@@ -1,7 +1,11 @@
 """The robot's files are reproducible and physical; its description is complete and refuses bad input."""
 
+# Pinocchio and Coal are compiled modules without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 import re
 import shutil
+from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
 
@@ -14,7 +18,7 @@ import trimesh
 import yaml
 
 from dora.errors import InputError
-from dora.robot import RobotDescription, Shape, available_robots, load_robot
+from dora.robot import Coupling, RobotDescription, Shape, available_robots, load_robot
 from dora.robot.build import build_urdf, write_urdf
 from dora.robot.description import clique_cover
 from dora.robot.rotations import matrix_from_quaternion
@@ -240,8 +244,6 @@ def test_clique_cover_covers_every_edge_and_no_other(seed):
 
 
 def test_too_many_ignored_pairs_are_refused(robot):
-    from dataclasses import replace
-
     left, right = [f"a{i}" for i in range(6)], [f"b{i}" for i in range(6)]
     bipartite = replace(robot, ignored_pairs=frozenset((a, b) for a in left for b in right))
     with pytest.raises(InputError, match="36 collision bits"):
@@ -256,6 +258,9 @@ def test_hand_expansion_couples_the_distal_joints(robot, make):
     assert (robot.reduce_hand(hand) == actuated).all()
     assert (hand[:, 3::4] == hand[:, 2::4]).all()
     assert list(robot.hand_actuated) == [i for i in range(20) if i % 4 != 3]
+    geared = replace(robot, couplings=(Coupling(follower=3, leader=2, multiplier=0.5, offset=0.1),))
+    actuated = make(np.random.default_rng(0).random((4, 19)))
+    assert (geared.expand_hand(actuated)[:, 3] == 0.5 * actuated[:, 2] + 0.1).all()
 
 
 def test_a_cylinder_with_two_equal_spheres_becomes_a_capsule():

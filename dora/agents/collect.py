@@ -1,7 +1,6 @@
 """Rollouts by TorchRL collectors, in this process or in worker processes that each hold a task batch."""
 
 import functools
-import os
 import signal
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -105,7 +104,7 @@ class Rollouts:
                     total_frames=-1,
                     cat_results=0,
                     use_buffers=True,
-                    num_threads=os.cpu_count(),
+                    num_threads=torch.get_num_threads(),
                     num_sub_threads=1,
                     trust_policy=True,
                     auto_register_policy_transforms=False,

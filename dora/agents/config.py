@@ -105,6 +105,8 @@ class RunConfig:
     """Environments in each worker."""
     workers: int = 1
     """Worker processes; 0 collects in the main process."""
+    learner_threads: int = 1
+    """Threads of the learner; more help on idle cores and cost much on busy ones (they wait by spinning)."""
     eval_every: int = 50_000
     """Environment steps between evaluations."""
     eval_episodes: int = 64
@@ -140,5 +142,8 @@ def config_from_dict(content: dict[str, Any]) -> RunConfig:
     Raises:
         TypeError, KeyError: if names are missing or unknown.
     """
-    learner = dict(content["learner"]) | {"hidden": tuple(content["learner"]["hidden"])}
-    return RunConfig(**(dict(content) | {"learner": LEARNER_CONFIGS[content["agent"]](**learner)}))
+    fields: dict[str, Any] = dict(content)
+    learner: dict[str, Any] = dict(fields["learner"])
+    learner["hidden"] = tuple(learner["hidden"])
+    fields["learner"] = LEARNER_CONFIGS[fields["agent"]](**learner)
+    return RunConfig(**fields)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 import torch
@@ -13,6 +13,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 
+@runtime_checkable
 class Task(Protocol):
     """N environments of one task stepped together; what every learner of Dora is written against.
 
@@ -102,7 +103,7 @@ class TaskEnv(EnvBase):
     """
 
     def __init__(self, task: Task, *, seed: int | None = None, stagger: bool = False):
-        super().__init__(device=task.device, batch_size=[task.num_envs])
+        super().__init__(device=task.device, batch_size=torch.Size([task.num_envs]))
         self.task = task
         self._pending_seed: int | list[int] | None = seed
         self.columns = EpisodeColumns.of(task.logged)
@@ -122,7 +123,7 @@ class TaskEnv(EnvBase):
         n, device = self.batch_size[0], self.device
 
         def flag() -> Binary:
-            return Binary(1, shape=(n, 1), dtype=torch.bool, device=device)
+            return Binary(1, shape=torch.Size([n, 1]), dtype=torch.bool, device=device)
 
         self.observation_spec = Composite(
             observation=Unbounded(observation.shape, device=device),
@@ -131,7 +132,7 @@ class TaskEnv(EnvBase):
             device=device,
         )
         self.action_spec = Bounded(self._low.expand(n, -1), self._high.expand(n, -1), device=device)
-        self.reward_spec = Unbounded((n, 1), device=device)
+        self.reward_spec = Unbounded(torch.Size([n, 1]), device=device)
         self.done_spec = Composite(
             done=flag(), terminated=flag(), truncated=flag(), shape=(n,), device=device
         )
@@ -199,10 +200,12 @@ class TaskEnv(EnvBase):
     def _count(self, reward: Float[Tensor, " n"], info: dict[str, Any]) -> None:
         """Bring the statistics of the running episodes up to date with one step."""
         one = torch.ones_like(self._limit, dtype=torch.float32)
-        own = {"whole": (self._limit == self.task.max_steps).float(), "return": reward, "length": one}
-        values = torch.stack(
-            [own.get(n, info.get(n, one)).reshape(-1).float() for n in self.columns.names], 1
-        )
+        given: dict[str, Tensor] = info | {
+            "whole": (self._limit == self.task.max_steps).float(),
+            "return": reward,
+            "length": one,
+        }
+        values = torch.stack([given[name].reshape(-1).float() for name in self.columns.names], 1)
         last, highest, total = values.split(
             [self._last.shape[1], self._highest.shape[1], self._total.shape[1]], dim=1
         )

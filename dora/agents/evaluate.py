@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -57,7 +58,7 @@ class Evaluation:
             return None
         return float(self.values("penetration_mm").quantile(quantile))
 
-    def rows(self) -> tuple[tuple[str, ...], list[list[float]]]:
+    def rows(self) -> tuple[tuple[str, ...], list[list[Any]]]:
         """Header and rows of `eval.csv`: episode number, then every column."""
         names = tuple(n for n in self.columns.names if n != "whole")
         values = torch.stack([self.values(n) for n in names], 1).tolist()

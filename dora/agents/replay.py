@@ -12,16 +12,17 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 from dora.agents.files import write_bytes
 from dora.errors import InputError
 
-SHARD = 16_384  # transitions per file
+SHARD = 16_384  # transitions per file at most
 
 
 class Replay:
-    """TorchRL's uniform replay buffer of the newest `capacity` transitions, stored in immutable shards.
+    """TorchRL's uniform replay buffer of the newest `capacity` transitions, stored in immutable files.
 
-    Transition k (counted from the start of the run) is in slot k mod capacity and in shard k // SHARD.
-    A shard's file is named after its number and the number of transitions in it, and never changes; a
-    checkpoint names the total, from which the files follow. Files of older checkpoints are removed only after
-    the newer checkpoint is in place, so that every checkpoint on disk is complete.
+    Transition k (counted from the start of the run) is in slot k mod capacity and in shard k // SHARD. A file
+    holds those transitions of one shard that the buffer has, is named after the first and the end, and never
+    changes; a checkpoint keeps the total, from which the files follow, so only the oldest and the newest
+    shard are written anew. Files of older checkpoints are removed only after the newer checkpoint is in
+    place, so that every checkpoint on disk is complete.
     """
 
     def __init__(self, capacity: int, batch: int):
@@ -40,7 +41,7 @@ class Replay:
 
     def sample(self) -> TensorDict:
         """A batch of transitions drawn uniformly."""
-        return self.buffer.sample()
+        return self.buffer.sample()  # pyright: ignore[reportReturnType]
 
     def save(self, folder: Path) -> None:
         """Write the shards that are not on disk yet.
@@ -77,16 +78,16 @@ class Replay:
                     f"The replay buffer {folder / name} is missing or damaged: the run cannot be resumed."
                 ) from error
             shard = TensorDict(data, batch_size=[end - first]).unflatten_keys("/")
-            self.buffer.storage.set(torch.arange(first, end) % self.capacity, shard)
+            slots = torch.arange(first, end) % self.capacity
+            self.buffer.storage.set(slots, shard)  # pyright: ignore[reportArgumentType]
         self.buffer.writer.load_state_dict({"_cursor": self.added % self.capacity})
 
     def _shards(self) -> list[tuple[str, int, int]]:
         """File name, first transition and end of every shard of the buffer."""
-        oldest = self.added - len(self)
-        first_shard = -(-oldest // SHARD)  # a shard that is partly overwritten is dropped as a whole
-        first_shard = first_shard if oldest else 0
         shards = []
-        for first in range(first_shard * SHARD, self.added, SHARD):
-            end = min(first + SHARD, self.added)
-            shards.append((f"{first // SHARD:06d}-{end - first:05d}.safetensors", first, end))
+        first = self.added - len(self)
+        while first < self.added:
+            end = min((first // SHARD + 1) * SHARD, self.added)
+            shards.append((f"{first:010d}-{end:010d}.safetensors", first, end))
+            first = end
         return shards

@@ -95,10 +95,10 @@ class RunFolder:
             return config_from_dict(yaml.safe_load((self.path / "config.yaml").read_text()))
         except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
             raise InputError(
-                f"{self.path} is not a run folder (it has no readable config.yaml): give one that a run printed."
+                f"{self.path} is not a run folder (no readable config.yaml): give one that a run printed."
             ) from error
 
-    def write_curve(self, rows: list[list[float]]) -> None:
+    def write_curve(self, rows: list[list[Any]]) -> None:
         """Write `curve.csv`."""
         write_csv(self.path / "curve.csv", CURVE_HEADER, rows)
 

@@ -44,10 +44,11 @@ class SAC:
         self.target = SoftUpdate(self.loss, tau=config.polyak)
         self.actor_parameters = _leaves(self.loss.actor_network_params)
         self.critic_parameters = _leaves(self.loss.qvalue_network_params)
+        log_alpha: Any = self.loss.log_alpha
         self.optimisers: dict[str, torch.optim.Optimizer] = {
             "actor_adam": torch.optim.Adam(self.actor_parameters, lr=config.learning_rate),
             "critic_adam": torch.optim.Adam(self.critic_parameters, lr=config.learning_rate),
-            "alpha_adam": torch.optim.Adam([self.loss.log_alpha], lr=config.learning_rate_alpha),
+            "alpha_adam": torch.optim.Adam([log_alpha], lr=config.learning_rate_alpha),
         }
         self.replay = Replay(config.capacity, config.batch)
         self.updates, self.due = 0, 0.0
@@ -68,9 +69,9 @@ class SAC:
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Store a batch (N, T), learn from the replay buffer and return the means of the losses by name."""
-        following = batch["next"].select("observation", "reward", "done", "terminated")
-        stored = batch.select("observation", "action").set("next", following)
-        self.replay.extend(stored.flatten().clone())
+        following = ("observation", "reward", "done", "terminated")
+        stored = batch.select("observation", "action", *(("next", name) for name in following))
+        self.replay.extend(stored.reshape(-1).clone())
         self.normaliser.update(batch["observation"])
         if self.replay.added < self.config.warmup:
             return {"replay": float(len(self.replay))}
@@ -105,16 +106,20 @@ class SAC:
         _descend(self.optimisers["critic_adam"], loss)
         return loss.detach()
 
+    def _alpha(self) -> Tensor:
+        log_alpha: Any = self.loss.log_alpha
+        return log_alpha.detach().exp()
+
     def _learn_actor(self, sample: TensorDict) -> Tensor:
         loss, metadata = self.loss.actor_loss(sample)
         _descend(self.optimisers["actor_adam"], loss)
         log_prob = metadata["log_prob"]
         alpha_loss = self.loss.alpha_loss(log_prob).mean()
         _descend(self.optimisers["alpha_adam"], alpha_loss)
-        return torch.stack([loss.detach(), self.loss.log_alpha.detach().exp(), -log_prob.mean()])
+        return torch.stack([loss.detach(), self._alpha(), -log_prob.mean()])
 
 
-def _leaves(parameters: Any) -> list[Tensor]:
+def _leaves(parameters: Any) -> list[Any]:
     return list(parameters.values(include_nested=True, leaves_only=True))
 
 

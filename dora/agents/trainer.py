@@ -4,7 +4,7 @@ import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -43,6 +43,7 @@ MakeTask = Callable[[int], Task]
 """Makes a task with the given number of environments; picklable."""
 
 
+@runtime_checkable
 class Learner(Protocol):
     """What the training loop needs of an algorithm."""
 
@@ -99,7 +100,7 @@ class Counters:
     """Success rate and return of the best evaluation."""
     reached: int = 0
     """Successive evaluations that reached `stop_success`."""
-    curve: list[list[float]] = field(default_factory=list)
+    curve: list[list[Any]] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=lambda: {"collect": 0.0, "learn": 0.0, "evaluate": 0.0})
 
 
@@ -118,6 +119,7 @@ class Trainer:
 
     def __init__(self, config: RunConfig, make_task: MakeTask, folder: RunFolder, *, resume: bool = False):
         self.config, self.make_task, self.folder = config, make_task, folder
+        torch.set_num_threads(config.learner_threads)
         self.counters = Counters(next_evaluation=config.eval_every)
         self._evaluation_env = TaskEnv(make_task(config.eval_envs))
         self.columns: EpisodeColumns = self._evaluation_env.columns

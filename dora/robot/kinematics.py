@@ -69,7 +69,7 @@ class SerialChain:
         self.velocity = tensor([joint.velocity for joint in moving])
         self._constant, self._cosine, self._sine = map(tensor, (constant, cosine, sine))
         self._tip = tensor(fixed)
-        self._axes = tensor([joint.axis / np.linalg.norm(joint.axis) for joint in moving]).unsqueeze(-1)
+        self._axes = tensor([joint.axis / np.linalg.norm(joint.axis) for joint in moving]).unsqueeze(-2)
         self._identity = torch.eye(6, dtype=dtype, device=device)
 
     @classmethod
@@ -105,7 +105,7 @@ class SerialChain:
 
     def jacobian_of(self, frames: Frames) -> Float[Tensor, "n 6 dof"]:
         """The same from frames that are already known: columns [a_i x (p - p_i); a_i]."""
-        axes = (frames.joints[..., :3, :3] @ self._axes).squeeze(-1)
+        axes = (frames.joints[..., :3, :3] * self._axes).sum(-1)
         arms = frames.tip[:, None, :3, 3] - frames.joints[..., :3, 3]
         return torch.cat((torch.linalg.cross(axes, arms), axes), -1).transpose(1, 2)
 

@@ -8,26 +8,35 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Link
 from torch import Tensor
 
+POSE = slice(0, 7)
+VELOCITY = slice(7, 13)
+
 
 class BodyReader:
-    """Reads k bodies of each of n environments at once.
+    """Reads k bodies of each of n environments at once, world frame of each environment.
 
-    On batched backends that is one gather from the rigid-body buffer; on a stock single CPU environment, one read
-    per body.
+    On batched backends a read is one gather from the rigid-body buffer; on a stock single CPU environment, one
+    read per body.
     """
 
     def __init__(self, scene: ManiSkillScene, bodies: Sequence[Actor | Link]):
         self.scene, self.bodies = scene, tuple(bodies)
         self._index: Tensor | None = None
 
-    def read(self) -> Float[Tensor, "n k 13"]:
-        """Position [m], quaternion wxyz, linear [m/s] and angular velocity [rad/s], world frame of each environment."""
-        if not self.scene.gpu_sim_enabled:
-            parts = [
-                torch.cat([b.pose.raw_pose, b.get_linear_velocity(), b.get_angular_velocity()], -1)
-                for b in self.bodies
-            ]
-            return torch.stack(parts, 1)
-        if self._index is None:
+    def poses(self) -> Float[Tensor, "n k 7"]:
+        """Position [m], quaternion wxyz."""
+        if self.scene.gpu_sim_enabled:
+            return self._gather(POSE)
+        return torch.stack([b.pose.raw_pose for b in self.bodies], 1)
+
+    def velocities(self) -> Float[Tensor, "n k 6"]:
+        """Linear [m/s] and angular velocity [rad/s]."""
+        if self.scene.gpu_sim_enabled:
+            return self._gather(VELOCITY)
+        parts = [torch.cat([b.get_linear_velocity(), b.get_angular_velocity()], -1) for b in self.bodies]
+        return torch.stack(parts, 1)
+
+    def _gather(self, columns: slice) -> Tensor:
+        if self._index is None:  # bodies have no rows before the scene is complete
             self._index = torch.stack([b._body_data_index for b in self.bodies], 1).long()
-        return self.scene.px.cuda_rigid_body_data.torch()[self._index]
+        return self.scene.px.cuda_rigid_body_data.torch()[self._index, columns]

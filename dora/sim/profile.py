@@ -8,9 +8,10 @@ PARTS = ("write", "physics", "read", "contacts")
 class StepProfile:
     """Seconds spent in each of ``PARTS`` since the last `clear`.
 
-    A batch system adds to it while it is assigned to ``env.unwrapped.scene.px.profile``; while that is None, measuring
-    costs one comparison per batch operation. Wall-clock time is used because its clock is cheap enough to be read
-    for every environment; other programs on the machine lengthen all parts alike, so the shares stay meaningful.
+    A batch system adds to it while it is assigned to ``env.unwrapped.scene.px.profile``; while that is
+    None, measuring costs one comparison per batch operation. Wall-clock time is used because its clock is
+    cheap enough to be read for every environment; other programs on the machine lengthen all parts alike,
+    so the shares stay meaningful.
     """
 
     def __init__(self):

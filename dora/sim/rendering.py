@@ -10,8 +10,8 @@ from mani_skill.utils.building import _mjcf_loader
 class NoMaterial:
     """Stands in for `sapien.render.RenderMaterial` on a machine without a Vulkan driver.
 
-    There the real class raises as soon as it is made, and ManiSkill's tasks make materials for visuals that are never
-    built. This one takes any arguments and attributes.
+    There the real class raises as soon as it is made, and ManiSkill's tasks make materials for visuals that
+    are never built. This one takes any arguments and attributes.
     """
 
     def __init__(self, *_: Any, **attributes: Any):
@@ -33,6 +33,7 @@ def can_render() -> bool:
         # The render system must come before any material: SAPIEN binds to the device of the first it meets.
         sapien.render.RenderSystem(sapien.Device("cpu"))
     except RuntimeError:
-        sapien.render.RenderMaterial = _mjcf_loader.RenderMaterial = NoMaterial  # type: ignore[misc,assignment]
+        for module in (sapien.render, _mjcf_loader):
+            vars(module)["RenderMaterial"] = NoMaterial
         return False
     return True

@@ -165,7 +165,8 @@ class DoraEnv(BaseEnv):
             self._terms = self._terms.without_guidance()
         entries = {**OBSERVATIONS, **self.EXTRA_OBSERVATIONS}
         self.observation_entries = {k: e for k, e in entries.items() if self.guided or not e.guided}
-        self._bodies = BodyReader(self.scene, [agent.wrist, *agent.tips, self.target_object])
+        self._poses = BodyReader(self.scene, [agent.wrist, *agent.tips, self.target_object])
+        self._velocities = BodyReader(self.scene, [agent.wrist, self.target_object])
         groups = dict(zip(FINGERS, agent.finger_links, strict=True))
         self._contacts = ContactMonitor(
             self.scene,
@@ -209,8 +210,8 @@ class DoraEnv(BaseEnv):
         return self._snapshot
 
     def _read(self) -> Snapshot:
-        body = self._bodies.read()
-        p, q, v, w = body[..., :3], body[..., 3:7], body[..., 7:10], body[..., 10:13]
+        pose, velocity = self._poses.poses(), self._velocities.velocities()
+        p, q, v, w = pose[..., :3], pose[..., 3:], velocity[..., :3], velocity[..., 3:]
         qpos, qvel = self.agent.robot.get_qpos(), self.agent.robot.get_qvel()
         e, r, hand_q = self.episode, self.reference, qpos[:, self._hand_index]
         goal_p, goal_q = r.goal(p[:, 6], q[:, 6])
@@ -220,7 +221,7 @@ class DoraEnv(BaseEnv):
             arm_q=qpos[:, self._arm_index], hand_q=hand_q, hand_v=qvel[:, self._hand_index],
             hand_target=controller.target[:, controller.arm_size :] if commanded else hand_q,
             wrist_p=p[:, 0], wrist_q=q[:, 0], wrist_v=v[:, 0], wrist_w=w[:, 0], tip_p=p[:, 1:6], tip_q=q[:, 1:6],
-            object_p=p[:, 6], object_q=q[:, 6], object_v=v[:, 6], object_w=w[:, 6],
+            object_p=p[:, 6], object_q=q[:, 6], object_v=v[:, 1], object_w=w[:, 1],
             object_half=self.object_half, start_p=e.start_p.clone(),
             touch=e.touch > 0, force=e.force.clone(), supported=e.supported > 0,
             penetration=e.penetration.clone(), deepest=e.deepest.clone(),

@@ -8,13 +8,29 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 
 from dora.errors import InputError
 from dora.robot import available_robots
-from dora.sim.rendering import choose_render_backend
+from dora.sim.rendering import can_render
 from dora.sim.robot import COUPLED, DescribedRobot, register_robot
 from dora.tasks.presets import Preset, find_preset
 
 GUIDANCE = ("affordance", "none")
 CONTROL_MODE = "wrist_delta_hand_pos"
 """Default control mode."""
+
+
+def choose_render_backend(render_mode: str | None, obs_mode: str | None) -> str:
+    """The render backend for a task: "none" unless a picture can be asked for.
+
+    Raises:
+        InputError: if one can be asked for and there is no Vulkan driver.
+    """
+    if render_mode is None and obs_mode in (None, "state", "state_dict", "none"):
+        return "none"
+    if not can_render():
+        raise InputError(
+            "rendering was asked for, but SAPIEN finds no Vulkan driver: install one (docs/rendering.md), or leave "
+            'render_mode at None and obs_mode at "state"'
+        )
+    return "gpu" if torch.cuda.is_available() else "cpu"
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ def check_action(env: Any, action: Any) -> None:
 
     Args:
         env: an unwrapped ManiSkill environment on `physx_cpu_batch`.
-        action: None, an array (environments, dimension), or a dictionary of those by robot, or a dictionary with
+        action: None, an array (environments, dimension), or a dictionary of those by robot, or a dictionary
+        with
             ``control_mode`` and ``action``. One environment may leave the batch axis out.
 
     Raises:
@@ -47,7 +48,9 @@ def _check_robots(env: Any, action: Mapping[str, Any]) -> None:
 
 def _check_array(action: Any, space: Any, environments: int, whose: str) -> None:
     if isinstance(space, spaces.Dict):
-        raise InputError(f"There are several robots: pass a dictionary of actions for {sorted(space.spaces)}.")
+        raise InputError(
+            f"There are several robots: pass a dictionary of actions for {sorted(space.spaces)}."
+        )
     shape, single = tuple(np.shape(action)), tuple(space.shape)
     if shape != (environments, *single) and not (environments == 1 and shape == single):
         raise InputError(f"The action{whose} has shape {shape} but {(environments, *single)} is needed.")

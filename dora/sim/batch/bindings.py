@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sapien
 from sapien.physx import PhysxArticulation as Articulation
-from sapien.physx import PhysxArticulationJoint as Joint
 
 from dora.sim.batch.layout import BODY_COLUMNS, BodyRow
 from dora.sim.batch.packed import POSE_FLOATS, GetterSource, Source
-from dora.sim.batch.table import BlockWriter, CallWriter, Part, Table
+from dora.sim.batch.table import BlockWriter, Part, Table
 
 if TYPE_CHECKING:
     from dora.sim.batch.system import BatchSystem
@@ -32,8 +31,9 @@ Setter = Callable[[np.ndarray], None]
 def make_tables(system: BatchSystem) -> dict[str, Table]:
     """All tables of a system by the names that `PhysxGpuSystem` gives them.
 
-    Rows of ``cuda_rigid_body_*`` are bodies, all others articulations; columns beyond an articulation's degrees of
-    freedom read as 0 and ignore writes. Forces and torques act in the next physics step and cannot be read.
+    Rows of ``cuda_rigid_body_*`` are bodies, all others articulations; columns beyond an articulation's
+    degrees of freedom read as 0 and ignore writes. Forces and torques act in the next physics step and
+    cannot be read.
     """
     links = (len(system.layout.articulations), system.layout.max_links, _SPATIAL_FORCE)
     return {
@@ -44,13 +44,13 @@ def make_tables(system: BatchSystem) -> dict[str, Table]:
         "cuda_articulation_qvel": _packed_joint_table(system, "qvel", Articulation.set_qvel),
         "cuda_articulation_qacc": _joint_table(system, Articulation.get_qacc, Articulation.set_qacc),
         "cuda_articulation_qf": _joint_table(system, Articulation.get_qf, Articulation.set_qf),
-        "cuda_articulation_target_qpos": _target_table(system, "target_qpos", Joint.set_drive_target),
-        "cuda_articulation_target_qvel": _target_table(system, "target_qvel", Joint.set_drive_velocity_target),
+        "cuda_articulation_target_qpos": _target_table(system, "target_qpos", "set_drive_target"),
+        "cuda_articulation_target_qvel": _target_table(system, "target_qvel", "set_drive_velocity_target"),
         "cuda_articulation_link_incoming_joint_forces": Table(
             links,
             _getter_planner(system, Articulation.get_link_incoming_joint_forces, links[1:]),
             _refuse,
-            system.refresh,
+            system.stepper.refresh,
         ),
     }
 
@@ -59,7 +59,7 @@ def _refuse(*_: Any) -> Any:
     raise TypeError("this table can be either read or written, not both: see dora.sim.batch.bindings")
 
 
-# ---- rigid bodies --------------------------------------------------------------------------------------------------
+# ---- rigid bodies --------------------------------------------------------------------------------
 
 
 def _body_table(system: BatchSystem) -> Table:
@@ -72,7 +72,7 @@ def _body_table(system: BatchSystem) -> Table:
     shape = (len(rows), BODY_COLUMNS)
     plan = partial(_plan_bodies, system)
     writer = BlockWriter(BODY_COLUMNS, blocks, lambda elements: table.read(elements), system.writing_bodies)
-    table = Table(shape, plan, writer, system.refresh)
+    table = Table(shape, plan, writer, system.stepper.refresh)
     return table
 
 
@@ -96,12 +96,12 @@ def _plan_bodies(system: BatchSystem, elements: np.ndarray) -> list[Part]:
 
 def _locate_poses(system: BatchSystem, elements: np.ndarray) -> Located:
     rows, columns = np.divmod(elements, BODY_COLUMNS)
-    return system.poses, system.pose_index[rows, columns]
+    return system.stepper.poses, system.pose_index[rows, columns]
 
 
 def _locate_actor_velocities(system: BatchSystem, elements: np.ndarray) -> Located:
     rows, columns = np.divmod(elements, BODY_COLUMNS)
-    return system.state, system.state_index.velocity[rows, columns - POSE_FLOATS]
+    return system.stepper.state, system.state_index.velocity[rows, columns - POSE_FLOATS]
 
 
 def _locate_link_velocities(system: BatchSystem, elements: np.ndarray) -> Located:
@@ -115,7 +115,7 @@ def _locate_link_velocities(system: BatchSystem, elements: np.ndarray) -> Locate
         else bodies[vector // 2].body.get_linear_velocity
         for vector in vectors.tolist()
     ]
-    return GetterSource(getters, system.epoch), vector_of.reshape(elements.shape) * _AXES + axis
+    return GetterSource(getters, system.stepper.epoch), vector_of.reshape(elements.shape) * _AXES + axis
 
 
 def _pose_setter(row: BodyRow) -> Setter:
@@ -128,7 +128,8 @@ def _set_pose(target: Any, pose: np.ndarray) -> None:
 
 
 def _velocity_setter(row: BodyRow, kind: str) -> Setter | None:
-    """Setter of a velocity; None for kinematic bodies and links other than roots, which have none of their own."""
+    """Setter of a velocity; None for kinematic bodies and links other than roots, which have none of their
+    own."""
     if not row.is_link:
         return None if row.body.kinematic else getattr(row.body, f"set_{kind}_velocity")
     return getattr(row.body.articulation, f"set_root_{kind}_velocity") if row.body.is_root else None
@@ -138,7 +139,7 @@ def _push_table(system: BatchSystem, push: Callable[[Any, np.ndarray], None]) ->
     bodies = system.layout.bodies
     block = (slice(0, _AXES), [partial(push, row.body) for row in bodies])
     writer = BlockWriter(_AXES, (block,), _refuse, system.writing_bodies)
-    return Table((len(bodies), _AXES), _refuse, writer, system.refresh)
+    return Table((len(bodies), _AXES), _refuse, writer, system.stepper.refresh)
 
 
 def _push(body: Any, force: np.ndarray) -> None:
@@ -149,10 +150,12 @@ def _twist(body: Any, torque: np.ndarray) -> None:
     body.add_force_torque(np.zeros(_AXES, np.float32), torque)
 
 
-# ---- articulations -------------------------------------------------------------------------------------------------
+# ---- articulations -------------------------------------------------------------------------------
 
 
-def _joint_writer(system: BatchSystem, setter: Callable, read: Callable[[np.ndarray], np.ndarray]) -> BlockWriter:
+def _joint_writer(
+    system: BatchSystem, setter: Callable, read: Callable[[np.ndarray], np.ndarray]
+) -> BlockWriter:
     layout = system.layout
     setters = [partial(_set_joints, setter, row.articulation, row.dof) for row in layout.articulations]
     return BlockWriter(
@@ -167,31 +170,41 @@ def _set_joints(setter: Callable, articulation: Articulation, dof: int, values: 
 def _packed_joint_table(system: BatchSystem, quantity: str, setter: Callable) -> Table:
     shape = (len(system.layout.articulations), system.layout.max_dof)
     writer = _joint_writer(system, setter, lambda elements: table.read(elements))
-    table = Table(shape, _state_planner(system, quantity), writer, system.refresh)
+    table = Table(shape, _state_planner(system, quantity), writer, system.stepper.refresh)
     return table
 
 
 def _joint_table(system: BatchSystem, getter: Callable, setter: Callable) -> Table:
     shape = (len(system.layout.articulations), system.layout.max_dof)
     writer = _joint_writer(system, setter, lambda elements: table.read(elements))
-    table = Table(shape, _getter_planner(system, getter, shape[1:]), writer, system.refresh)
+    table = Table(shape, _getter_planner(system, getter, shape[1:]), writer, system.stepper.refresh)
     return table
 
 
-def _target_table(system: BatchSystem, quantity: str, setter: Callable) -> Table:
+def _target_table(system: BatchSystem, quantity: str, setter: str) -> Table:
     layout = system.layout
-    setters: list[Callable[[float], None] | None] = []
+    setters: list[Callable[[float], None]] = []
     for row in layout.articulations:
-        setters += [partial(setter, joint) for joint in row.joints]
-        setters += [None] * (layout.max_dof - row.dof)
-    writer = CallWriter(layout.max_dof, setters, system.writing_targets)
+        setters += [getattr(joint, setter) for joint in row.joints]
+        setters += [_ignore] * (layout.max_dof - row.dof)
+
+    def write(elements: np.ndarray, values: np.ndarray) -> None:
+        numbers = elements.ravel()
+        environments = layout.articulation_environment[numbers // layout.max_dof]
+        stepper.set_targets(setters, numbers, values.ravel(), environments)
+
+    stepper = system.stepper
     shape = (len(layout.articulations), layout.max_dof)
-    return Table(shape, _state_planner(system, quantity), writer, system.refresh_targets)
+    return Table(shape, _state_planner(system, quantity), write, stepper.refresh_targets)
+
+
+def _ignore(_: float) -> None:
+    """Setter of a column that an articulation with fewer joints does not have."""
 
 
 def _state_planner(system: BatchSystem, quantity: str) -> Callable[[np.ndarray], Sequence[Part]]:
     def plan(elements: np.ndarray) -> list[Part]:
-        return [Part(system.state, getattr(system.state_index, quantity).ravel()[elements])]
+        return [Part(system.stepper.state, getattr(system.state_index, quantity).ravel()[elements])]
 
     return plan
 
@@ -206,5 +219,5 @@ def _getter_planner(
     index = np.full((len(rows), width), sum(lengths), np.int64)
     for row, (length, start) in enumerate(zip(lengths, np.cumsum([0, *lengths]).tolist(), strict=False)):
         index[row, :length] = np.arange(start, start + length)
-    source = GetterSource([partial(getter, row.articulation) for row in rows], system.epoch)
+    source = GetterSource([partial(getter, row.articulation) for row in rows], system.stepper.epoch)
     return lambda elements: [Part(source, index.ravel()[elements])]

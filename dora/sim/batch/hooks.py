@@ -75,7 +75,7 @@ def runs_batched(env: Any) -> bool:
     return env.unwrapped.backend.sim_backend == BACKEND
 
 
-# ---- environments --------------------------------------------------------------------------------------------------
+# ---- environments --------------------------------------------------------------------------------
 
 
 def _parse_backends(original: Callable) -> Callable:
@@ -117,7 +117,9 @@ def _setup_scene(original: Callable) -> Callable:
             logger.warning(f"render_mode {self.render_mode!r} has no effect because there is no renderer.")
         self._set_scene_config()
         scenes = [
-            sapien.Scene([physx.PhysxCpuSystem(), *(sapien.render.RenderSystem(device) for device in renderers)])
+            sapien.Scene(
+                [physx.PhysxCpuSystem(), *(sapien.render.RenderSystem(device) for device in renderers)]
+            )
             for _ in range(self.num_envs)
         ]
         self.scene = BatchScene(scenes, sim_config=self.sim_config, device=self.device, backend=self.backend)
@@ -134,11 +136,11 @@ def _step_action(original: Callable) -> Callable:
         hooks = ("_before_simulation_step", "_after_simulation_step")
         watched = any(_is_overridden(self, hook) for hook in hooks)
         system = self.scene.px
-        system.defer(1 if watched else self._sim_steps_per_control)
+        system.defer(0 if watched else self._sim_steps_per_control)
         try:
             return original(self, action)
         finally:
-            system.defer(1)
+            system.defer(0)
 
     return step_action
 
@@ -148,7 +150,7 @@ def _is_overridden(env: BaseEnv, method: str) -> bool:
     return getattr(getattr(env, method), "__func__", None) is not getattr(BaseEnv, method)
 
 
-# ---- structs and controllers ---------------------------------------------------------------------------------------
+# ---- structs and controllers ---------------------------------------------------------------------
 
 
 def _get_meshes(original: Callable) -> Callable:

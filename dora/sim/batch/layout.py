@@ -11,7 +11,9 @@ from sapien import physx
 from dora.sim.batch.packed import POSE_FLOATS, POSE_ORDER, RIGID_FLOATS, PackedSource
 
 BODY_COLUMNS = 13
-"""Columns of a body's row: position [m], quaternion wxyz, linear [m/s] and angular [rad/s] velocity; world frame."""
+"""Columns of a body's row: position [m], quaternion wxyz, linear [m/s] and angular [rad/s] velocity; world
+frame."""
+
 
 @dataclass(frozen=True, eq=False)
 class BodyRow:
@@ -54,9 +56,7 @@ class Layout:
             environments = articulation._scene_idxs.tolist()
             for env, px_articulation in zip(environments, articulation._objs, strict=True):
                 joints = tuple(px_articulation.active_joints)
-                self.articulations.append(
-                    ArticulationRow(env, px_articulation, joints, px_articulation.dof)
-                )
+                self.articulations.append(ArticulationRow(env, px_articulation, joints, px_articulation.dof))
             for link in articulation.links:
                 for env, body in zip(environments, link._objs, strict=True):
                     self.bodies.append(BodyRow(env, body.entity, body, is_link=True))
@@ -83,7 +83,8 @@ def pose_index(layout: Layout, scenes: list[sapien.Scene], poses: PackedSource) 
 class StateIndex:
     """Index into ``state.flat()``; entries without a value point at its padding zero.
 
-    ``velocity`` (actor bodies, 6); ``qpos``, ``qvel``, ``target_qpos``, ``target_qvel`` (articulations, max dof).
+    ``velocity`` (actor bodies, 6); ``qpos``, ``qvel``, ``target_qpos``, ``target_qvel`` (articulations, max
+    dof).
     """
 
     velocity: np.ndarray

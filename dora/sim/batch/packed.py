@@ -1,8 +1,8 @@
 """Simulator state of many environments as flat float32 arrays, re-read only where it went stale.
 
 SAPIEN packs a whole scene into bytes in one C++ call: `Scene.pack_poses` gives the poses of all entities and
-`PhysxCpuSystem.pack` the state of all bodies and articulations. One such call replaces dozens of getters, returns
-exact copies of the simulator's numbers and changes nothing in it.
+`PhysxCpuSystem.pack` the state of all bodies and articulations. One such call replaces dozens of getters,
+returns exact copies of the simulator's numbers and changes nothing in it.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -32,34 +32,34 @@ class Source(Protocol):
 class PackedSource:
     """The packed bytes of all environments, concatenated, with one zero at the end for padding.
 
-    ``readers[i]()`` returns the bytes of environment i. `refresh` calls those that were invalidated since the last
-    call; between the two the values are those of the last `refresh`.
+    ``readers[i]()`` returns the bytes of environment i. `refresh` calls those that were invalidated and not
+    read since; between two calls of it the values do not change.
     """
 
     def __init__(self, readers: Sequence[Callable[[], bytes]]):
         self._readers = list(readers)
         self._chunks = [b""] * len(self._readers)
-        self._stale: set[int] = set()
-        self._all_stale = True
+        self._everyone = frozenset(range(len(self._readers)))
+        self._stale = set(self._everyone)
         self._flat = np.zeros(1, np.float32)
 
     def invalidate_all(self) -> None:
         """Declare the values of every environment out of date."""
-        self._all_stale = True
+        self._stale = set(self._everyone)
 
     def invalidate(self, environments: Iterable[int]) -> None:
         """Declare the values of some environments out of date."""
         self._stale.update(environments)
 
+    def read(self, environment: int) -> None:
+        """Read one environment ahead of the next `refresh`."""
+        self._chunks[environment] = self._readers[environment]()
+        self._stale.discard(environment)
+
     def refresh(self) -> bool:
-        """Read what is out of date; True if the number of values changed."""
-        if self._all_stale:
-            self._chunks = [read() for read in self._readers]
-        else:
-            for environment in self._stale:
-                self._chunks[environment] = self._readers[environment]()
-        self._all_stale = False
-        self._stale.clear()
+        """Read what is out of date and show the new values; True if their number changed."""
+        for environment in tuple(self._stale):
+            self.read(environment)
         size = self._flat.size
         self._flat = np.frombuffer(b"".join((*self._chunks, _ZERO)), np.float32)
         return self._flat.size != size

@@ -44,8 +44,8 @@ class BatchScene(ManiSkillScene):
     """ManiSkill's scene with one CPU sub-scene per environment and a `BatchSystem` for its physics.
 
     ``gpu_sim_enabled`` is true, because it selects the code of ManiSkill that handles many environments.
-    ``rendered_environments`` chooses those that `render` shows (all by default): pictures are the costly part on a
-    CPU. Cameras that make observations always render all environments.
+    ``rendered_environments`` chooses those that `render` shows (all by default): pictures are the costly
+    part on a CPU. Cameras that make observations always render all environments.
     """
 
     px: BatchSystem
@@ -67,7 +67,7 @@ class BatchScene(ManiSkillScene):
     def _gpu_fetch_all(self) -> None:
         """Nothing: values are read when they are asked for."""
 
-    # ---- rendering ---------------------------------------------------------------------------------------------
+    # ---- rendering -------------------------------------------------------------------------------
 
     def add_camera(self, *args: Any, **kwargs: Any) -> RenderCamera:
         """Add a camera to every environment; mounted ones follow their entity as on a single CPU."""
@@ -97,4 +97,5 @@ class BatchScene(ManiSkillScene):
     def _group_cameras(self, cameras: dict[str, BaseSensor], environments: Sequence[int]) -> None:
         for name, sensor in cameras.items():
             chosen = [sensor.camera._render_cameras[i] for i in environments]  # type: ignore[attr-defined]
-            sensor.camera.camera_group = self.camera_groups[name] = CameraGroup(chosen)  # type: ignore[attr-defined]
+            sensor.camera.camera_group = self.camera_groups[name] = CameraGroup(chosen)  # type:
+            ignore[attr - defined]

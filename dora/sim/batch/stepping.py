@@ -1,13 +1,14 @@
 """Writes, steps and reads the environments, one after the other."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import sapien
 from sapien import physx
 
 from dora.sim.batch.packed import PackedSource
-from dora.sim.batch.queries import ContactImpulses
+from dora.sim.batch.queries import ContactImpulses, ContactScanner
 from dora.sim.profile import StepProfile
 
 Setters = Sequence[Callable[[float], None]]
@@ -23,7 +24,9 @@ class TargetQueue:
     def __len__(self) -> int:
         return len(self._batches)
 
-    def add(self, setters: Setters, numbers: np.ndarray, values: np.ndarray, environments: np.ndarray) -> None:
+    def add(
+        self, setters: Setters, numbers: np.ndarray, values: np.ndarray, environments: np.ndarray
+    ) -> None:
         """Let ``setters[numbers[k]](values[k])`` wait for environment ``environments[k]``."""
         order = np.argsort(environments, kind="stable")
         edges = np.searchsorted(environments[order], self._edges)
@@ -45,9 +48,9 @@ class Stepper:
     """Keeps the simulators of all environments and what was read of them in step.
 
     The processor's caches hold one environment but not all of them, so everything that has to be done with an
-    environment in a control step is done at one go: its drive targets are set, all its physics steps made, its state
-    and its contacts read; then comes the next. To that end `defer` lets writes and steps wait. Environments do not
-    interact, so results do not depend on this order.
+    environment in a control step is done at one go: its drive targets are set, all its physics steps made,
+    its state and its contacts read; then comes the next. To that end `defer` lets writes and steps wait.
+    Environments do not interact, so results do not depend on this order.
     """
 
     def __init__(self, scenes: Sequence[sapien.Scene]):
@@ -55,6 +58,7 @@ class Stepper:
         self.poses = PackedSource([scene.pack_poses for scene in scenes])
         self.state = PackedSource([system.pack for system in systems])
         self.contacts = ContactImpulses([system.get_contacts for system in systems])
+        self.scanners: list[ContactScanner] = [self.contacts]
         self.profile: StepProfile | None = None
         self.resized: Callable[[], None] = lambda: None
         self._steps = [system.step for system in systems]
@@ -72,8 +76,8 @@ class Stepper:
     def defer(self, steps: int) -> None:
         """Let drive targets and up to ``steps`` physics steps wait until a value is read or set otherwise.
 
-        While they wait, sapien objects must not be used directly. ``defer(0)``, the initial setting, makes up for
-        all that waits and lets nothing wait.
+        While they wait, sapien objects must not be used directly. ``defer(0)``, the initial setting, makes
+        up for all that waits and lets nothing wait.
         """
         self._limit = steps
         if not steps:
@@ -94,39 +98,93 @@ class Stepper:
         if not self._waiting and not self._targets:
             return
         steps, self._waiting = range(self._waiting), 0
-        if not steps:
-            self._write_all()
-        elif self.profile is None:
-            self._advance_all(steps, read=self._limit > 0)
-        else:
-            self._advance_all_measured(steps, self.profile, read=self._limit > 0)
-        self._targets.clear()
         if steps:
-            self.contacts.forget()
+            self._advance(steps, sources=(self.poses, self.state) if self._limit else ())
+        else:
+            for environment in range(len(self._steps)):
+                self._targets.write(environment)
+        self._targets.clear()
 
-    def _write_all(self) -> None:
-        for environment in range(len(self._steps)):
-            self._targets.write(environment)
-
-    def _advance_all(self, steps: range, read: bool) -> None:
-        write, read_poses, read_state = self._targets.write, self.poses.read, self.state.read
+    def _advance(self, steps: range, sources: Sequence[PackedSource]) -> None:
+        """Set targets, make steps and read ``sources``, one environment after the other."""
+        profile, targets = self.profile, self._targets
+        scanners = [scanner for scanner in self.scanners if scanner.begin_step()]
+        if profile:
+            profile.mark()
         for environment, step in enumerate(self._steps):
-            write(environment)
+            targets.write(environment)
+            if profile:
+                profile.add("write")
             for _ in steps:
                 step()
-            if read:
-                read_poses(environment)
-                read_state(environment)
-
-    def _advance_all_measured(self, steps: range, profile: StepProfile, read: bool) -> None:
-        profile.mark()
-        for environment, step in enumerate(self._steps):
-            self._targets.write(environment)
-            profile.add("write")
-            for _ in steps:
-                step()
-            profile.add("physics")
-            if read:
-                self.poses.read(environment)
-                self.state.read(environment)
+            if profile:
+                profile.add("physics")
+            for source in sources:
+                source.read(environment)
+            if profile:
                 profile.add("read")
+            for scanner in scanners:
+                scanner.scan(environment)
+            if profile:
+                profile.add("contacts")
+
+    def refresh(self) -> None:
+        """Do all that waits and read what is out of date."""
+        if not self._stale:
+            return
+        self.flush()
+        if self.profile:
+            self.profile.mark()
+        resized = self.poses.refresh(), self.state.refresh()
+        self._stale = False
+        if self.profile:
+            self.profile.add("read")
+        if any(resized):
+            self.resized()
+
+    def refresh_targets(self) -> None:
+        """`refresh` for drive targets. Writing targets leaves all other values of the packed state as they
+        were."""
+        if self._targets_stale:
+            self.flush()
+            self.state.invalidate_all()
+            self._stale, self._targets_stale = True, False
+        self.refresh()
+
+    def scan_contacts(self, scanner: ContactScanner) -> None:
+        """Do all that waits and scan the contacts, unless that was done since the last physics step."""
+        self.flush()
+        if self.profile:
+            self.profile.mark()
+        scanner.scan_missing()
+        if self.profile:
+            self.profile.add("contacts")
+
+    def changed(self, environments: Iterable[int]) -> None:
+        """Declare everything read of some environments out of date."""
+        self._epoch += 1
+        self._stale = True
+        self.poses.invalidate(environments)
+        self.state.invalidate(environments)
+
+    def set_targets(
+        self, setters: Setters, numbers: np.ndarray, values: np.ndarray, environments: np.ndarray
+    ) -> None:
+        """Call ``setters[numbers[k]](values[k])`` for environment ``environments[k]``, now or before its
+        next step."""
+        self._targets.add(setters, numbers, values, environments)
+        self._targets_stale = True
+        if not self._limit:
+            self.flush()
+
+    @contextmanager
+    def writing(self, environments: Sequence[int]) -> Iterator[None]:
+        """Around a direct change of some environments: does what waits before it, and declares them changed
+        after it."""
+        self.flush()
+        if self.profile:
+            self.profile.mark()
+        yield
+        if self.profile:
+            self.profile.add("write")
+        self.changed(environments)

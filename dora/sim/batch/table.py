@@ -13,14 +13,16 @@ from torch import Tensor
 from dora.sim.batch.packed import Source
 
 _PLANS_KEPT = 1024
-"""Reading plans remembered per table. ManiSkill's structs index with the same tensors for ever, so few are needed."""
+"""Reading plans remembered per table. ManiSkill's structs index with the same tensors for ever, so few are
+needed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
     """Where some elements of a table come from: ``source.flat()[index]``.
 
-    ``where`` are their positions in the flattened result, or None if they are all of it (``index`` then has its shape).
+    ``where`` are their positions in the flattened result, or None if they are all of it (``index`` then has
+    its shape).
     """
 
     source: Source
@@ -47,8 +49,8 @@ class Table:
     """A table of simulator values with the interface of a `sapien.CudaArray`.
 
     ``table.torch()[key]`` reads the values of now, only those asked for, and returns a new tensor;
-    ``table.torch()[key] = value`` writes them into the simulator at once. Nothing is stored in between, so there is
-    nothing to fetch and nothing to apply.
+    ``table.torch()[key] = value`` writes them into the simulator at once. Nothing is stored in between, so
+    there is nothing to fetch and nothing to apply.
 
     Args:
         shape: shape of the table; the first axis numbers bodies or articulations.
@@ -113,7 +115,9 @@ class Table:
         return getattr(self[...], name)
 
     @classmethod
-    def __torch_function__(cls, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+    def __torch_function__(
+        cls, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None
+    ) -> Any:
         """Let torch functions take a table where they take a tensor: they get a copy of it."""
         if function.__name__.endswith("_") and not function.__name__.endswith("__"):
             raise TypeError(f"write with table[...] = value: {function.__name__}() would change a copy")
@@ -133,29 +137,12 @@ def _signature(key: Any) -> tuple:
     return ("object", id(key))
 
 
-class CallWriter:
-    """Writes each element by its own setter, for drive targets: ``setters[element](value)``; None ignores it.
-
-    ``writing(rows)`` is a context around the calls that knows what they change.
-    """
-
-    def __init__(self, width: int, setters: Sequence[Callable[[float], None] | None], writing: Writing):
-        self._width, self._setters, self._writing = width, setters, writing
-
-    def __call__(self, elements: np.ndarray, values: np.ndarray) -> None:
-        setters, numbers = self._setters, elements.ravel()
-        with self._writing(numbers // self._width):
-            for element, value in zip(numbers.tolist(), values.ravel().tolist(), strict=True):
-                setter = setters[element]
-                if setter is not None:
-                    setter(value)
-
-
 class BlockWriter:
     """Writes the blocks of a row by their setters: ``blocks`` holds (columns, one setter or None per row).
 
-    Blocks go in the order given. A block that is written in part keeps the current values of its other columns,
-    which ``read`` returns for element numbers. ``writing(rows)`` is a context around the calls.
+    Blocks go in the order given. A block that is written in part keeps the current values of its other
+    columns, which ``read`` returns for element numbers. ``writing(rows)`` is a context around the setters'
+    calls.
     """
 
     def __init__(

@@ -1,0 +1,189 @@
+"""Environment steps per second: ours against ManiSkill's own way of using several cores, on the same task."""
+
+import multiprocessing
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401  (registers the tasks)
+import numpy as np
+import torch
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
+
+import dora  # noqa: F401  (registers Dora's tasks)
+from dora.errors import InputError
+from dora.sim import BACKEND, StepProfile
+
+REFERENCE_PROCESSES = (2, 4, 8)
+"""Process counts that the reference may choose from."""
+_ACTIONS_DRAWN = 64
+_WARM_UP_STEPS = 10
+_START_TIMEOUT = 300.0
+"""Longest time to build all environments [s]."""
+_TASK = {"obs_mode": "state", "render_backend": "none"}
+
+
+@dataclass(frozen=True)
+class EnvReport:
+    """Result of `measure`.
+
+    ``ratio`` is ``env_steps_per_second`` over ``reference_env_steps_per_second``; ``physics_share`` the part of our
+    step that is PhysX; ``shares`` all parts (``other`` is torch, ManiSkill and resets); ``cpu_microseconds`` the
+    processor time of one environment step; ``seconds`` the length of each measurement.
+    """
+
+    env: str
+    num_envs: int
+    workers: int
+    env_steps_per_second: float
+    reference_env_steps_per_second: float
+    ratio: float
+    physics_share: float
+    seconds: float
+    reference_processes: int
+    cpu_microseconds: float
+    shares: dict[str, float] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The report as JSON-ready values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class _Measured:
+    steps: int
+    seconds: float
+    cpu_seconds: float
+    shares: dict[str, float]
+
+
+def measure(env_id: str, num_envs: int, workers: int, seconds: float) -> EnvReport:
+    """Measure ours, then the reference with each of ``REFERENCE_PROCESSES``.
+
+    Args:
+        env_id: any ManiSkill task.
+        num_envs: environments in each of our processes.
+        workers: our processes.
+        seconds: length of each measurement.
+
+    Raises:
+        InputError: if a number is not positive or there is no such task.
+    """
+    for name, value in (("num_envs", num_envs), ("workers", workers), ("seconds", seconds)):
+        if value <= 0:
+            raise InputError(f"{name} is {value}: it must be positive.")
+    if env_id not in gym.registry:
+        raise InputError(f"There is no task {env_id!r}: see gymnasium.registry for the ids.")
+    ours = _run_workers(env_id, num_envs, workers, seconds)
+    rate = sum(part.steps / part.seconds for part in ours)
+    shares = {name: float(np.mean([part.shares[name] for part in ours])) for name in ours[0].shares}
+    references = {count: _reference_rate(env_id, count, seconds) for count in REFERENCE_PROCESSES}
+    best = max(references, key=lambda count: references[count])
+    return EnvReport(
+        env=env_id,
+        num_envs=num_envs,
+        workers=workers,
+        env_steps_per_second=rate,
+        reference_env_steps_per_second=references[best],
+        ratio=rate / references[best],
+        physics_share=shares["physics"],
+        seconds=seconds,
+        reference_processes=best,
+        cpu_microseconds=1e6 * sum(part.cpu_seconds for part in ours) / sum(part.steps for part in ours),
+        shares=shares,
+    )
+
+
+def _run_workers(env_id: str, num_envs: int, workers: int, seconds: float) -> list[_Measured]:
+    context = multiprocessing.get_context("spawn")
+    barrier, results = context.Barrier(workers), context.SimpleQueue()
+    processes = [
+        context.Process(target=_work, args=(env_id, num_envs, seed, seconds, barrier, results), daemon=True)
+        for seed in range(workers)
+    ]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+        if process.exitcode:
+            raise RuntimeError(f"a measuring process ended with status {process.exitcode}")
+    return [results.get() for _ in processes]
+
+
+def _work(env_id: str, num_envs: int, seed: int, seconds: float, barrier: Any, results: Any) -> None:
+    torch.set_num_threads(1)
+    env = gym.make(env_id, num_envs=num_envs, sim_backend=BACKEND, **_TASK)
+    step = _random_stepper(env, num_envs, seed)
+    profile = StepProfile()
+    env.unwrapped.scene.px.profile = profile  # type: ignore[attr-defined]
+    for _ in range(_WARM_UP_STEPS):
+        step()
+    barrier.wait(_START_TIMEOUT)
+    profile.clear()
+    cpu = time.process_time()
+    rounds, elapsed = _repeat(step, seconds)
+    results.put(_Measured(rounds * num_envs, elapsed, time.process_time() - cpu, profile.shares()))
+    env.close()
+
+
+def _random_stepper(env: gym.Env, num_envs: int, seed: int) -> Callable[[], None]:
+    """A function that makes one random step and resets the environments whose episode ended."""
+    env.action_space.seed(seed)
+    actions = [env.action_space.sample() for _ in range(_ACTIONS_DRAWN)]
+    env.reset(seed=[seed * num_envs + i for i in range(num_envs)])
+    made = 0
+
+    def step() -> None:
+        nonlocal made
+        _, _, terminated, truncated, _ = env.step(actions[made % _ACTIONS_DRAWN])
+        made += 1
+        ended = torch.as_tensor(terminated) | torch.as_tensor(truncated)
+        if ended.any():
+            env.reset(options={"env_idx": ended.nonzero().flatten()})
+
+    return step
+
+
+def _repeat(step: Callable[[], None], seconds: float) -> tuple[int, float]:
+    rounds, start = 0, time.perf_counter()
+    while (elapsed := time.perf_counter() - start) < seconds:
+        step()
+        rounds += 1
+    return rounds, elapsed
+
+
+def _single_env(env_id: str) -> gym.Env:
+    torch.set_num_threads(1)
+    return CPUGymWrapper(gym.make(env_id, num_envs=1, sim_backend="physx_cpu", **_TASK))
+
+
+def _reference_rate(env_id: str, processes: int, seconds: float) -> float:
+    """Environment steps per second of an `AsyncVectorEnv`, which resets ended episodes within the step as ours does."""
+    makers = [lambda: _single_env(env_id)] * processes
+    env = AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
+    try:
+        env.action_space.seed(0)
+        actions = [env.action_space.sample() for _ in range(_ACTIONS_DRAWN)]
+        env.reset(seed=list(range(processes)))
+        made = 0
+
+        def step() -> None:
+            nonlocal made
+            env.step(actions[made % _ACTIONS_DRAWN])
+            made += 1
+
+        for _ in range(_WARM_UP_STEPS):
+            step()
+        rounds, elapsed = _repeat(step, seconds)
+    finally:
+        env.close()
+    return rounds * processes / elapsed
+
+
+def all_cores() -> int:
+    """Number of processor cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,167 @@
+"""Contacts between groups of bodies, read once per control step."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dora.errors import InputError
+from dora.sim.batch.queries import ContactScanner
+from dora.sim.batch.scene import BatchScene
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Contacts among g groups of bodies in n environments.
+
+    Attributes:
+        impulse: sum over contact points of the impulse on group i by group j [N s], world frame.
+        Antisymmetric in
+            the groups; contacts inside a group add up to 0.
+        separation: smallest distance over the contact points of two groups [m]: negative is penetration,
+        +inf means
+            that PhysX reports no contact between them. Symmetric. NaN on a GPU, which does not report it.
+    """
+
+    impulse: Float[Tensor, "n g g 3"]
+    separation: Float[Tensor, "n g g"]
+
+
+class ContactMonitor:
+    """Reads the contacts between named groups of actors and links.
+
+    Works on a single CPU environment, on ``physx_cpu_batch`` (where it is fastest) and, through pair
+    queries, on a GPU (impulses only; not tested). The order of the groups in `Contacts` is that of
+    ``groups``.
+
+    PhysX reports the contacts of the last physics step only. To catch blows that are shorter than a control
+    step, call `sample` after every physics step (from ``_after_simulation_step``) and `take` once per
+    control step.
+
+    Args:
+        scene: the ManiSkill scene of the bodies; make a new monitor after a reconfiguration.
+        groups: actors or links by the name of their group. A body may be in one group only.
+
+    Raises:
+        InputError: if a body is in two groups.
+    """
+
+    def __init__(self, scene: Any, groups: Mapping[str, Sequence[Any]]):
+        self.names = tuple(groups)
+        self._scene = scene
+        self._sampled: list[Contacts] = []
+        if scene.gpu_sim_enabled and not isinstance(scene, BatchScene):
+            self._scanner, self._pairs = None, _gpu_pairs(groups)
+            return
+        if isinstance(scene, BatchScene):
+            readers = [system.get_contacts for system in scene.px.systems]
+        else:
+            readers = [scene.px.get_contacts]
+        self._scanner = _GroupScanner(readers, groups)
+        if isinstance(scene, BatchScene):
+            scene.px.stepper.scanners.append(self._scanner)
+
+    def read(self) -> Contacts:
+        """Contacts of the last physics step."""
+        if self._scanner is None:
+            return self._read_gpu()
+        if isinstance(self._scene, BatchScene):
+            self._scene.px.stepper.scan_contacts(self._scanner)
+            return self._scanner.result()
+        self._scanner.begin_step()
+        self._scanner.scan(0)
+        return self._scanner.result()
+
+    def sample(self) -> None:
+        """Remember the contacts of the physics step just made, for `take`."""
+        self._sampled.append(self.read())
+
+    def take(self) -> Contacts:
+        """Contacts since the last `take`: impulses summed and separations minimal over the samples.
+
+        Without samples these are the contacts of the last physics step.
+        """
+        samples, self._sampled = self._sampled or [self.read()], []
+        return Contacts(
+            impulse=torch.stack([sample.impulse for sample in samples]).sum(0),
+            separation=torch.stack([sample.separation for sample in samples]).amin(0),
+        )
+
+    def _read_gpu(self) -> Contacts:
+        count = len(self.names)
+        impulse = torch.zeros(self._scene.num_envs, count, count, 3, device=self._scene.device)
+        for first, second, one, other in self._pairs:
+            pair = self._scene.get_pairwise_contact_impulses(one, other)
+            impulse[:, first, second] += pair
+            impulse[:, second, first] -= pair
+        return Contacts(impulse, torch.full(impulse.shape[:-1], torch.nan, device=impulse.device))
+
+
+def _gpu_pairs(groups: Mapping[str, Sequence[Any]]) -> list[tuple[int, int, Any, Any]]:
+    members = list(enumerate(groups.values()))
+    return [
+        (first, second, one, other)
+        for first, ones in members
+        for second, others in members[first + 1 :]
+        for one in ones
+        for other in others
+    ]
+
+
+class _GroupScanner(ContactScanner):
+    """Collects points between bodies of groups; adds them up only when the result is wanted."""
+
+    def __init__(self, readers: Sequence[Callable[[], list]], groups: Mapping[str, Sequence[Any]]):
+        super().__init__(readers)
+        self._count = len(groups)
+        self._group_of: dict[int, int] = {}
+        members = [member for group in groups.values() for member in group]
+        self._kept_alive = [body for member in members for body in member._bodies]
+        for group, (name, members) in enumerate(groups.items()):
+            for member in members:
+                for body in member._bodies:
+                    if self._group_of.setdefault(id(body), group) != group:
+                        raise InputError(
+                            f"{member.name} is in group {name} and in another one: leave it in one of them."
+                        )
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all points."""
+        self._slots: list[int] = []
+        self._impulses: list[np.ndarray] = []
+        self._separations: list[float] = []
+
+    def take(self, environment: int, contacts: list) -> None:
+        """Collect the points between groups: slot (environment, first, second), impulse on the first,
+        separation."""
+        group_of, count = self._group_of.get, self._count
+        for contact in contacts:
+            first, second = contact.bodies
+            first = group_of(id(first))
+            if first is None:
+                continue
+            second = group_of(id(second))
+            if second is None:
+                continue
+            slot = (environment * count + first) * count + second
+            for point in contact.points:
+                self._slots.append(slot)
+                self._impulses.append(point.impulse)
+                self._separations.append(point.separation)
+
+    def result(self) -> Contacts:
+        """The points added up."""
+        shape = (len(self._readers), self._count, self._count)
+        impulse = np.zeros((*shape, 3), np.float32)
+        separation = np.full(shape, np.inf, np.float32)
+        if self._slots:
+            np.add.at(impulse.reshape(-1, 3), self._slots, np.array(self._impulses))
+            np.minimum.at(separation.reshape(-1), self._slots, self._separations)
+        impulse = impulse - impulse.swapaxes(1, 2)
+        separation = np.minimum(separation, separation.swapaxes(1, 2))
+        return Contacts(torch.from_numpy(impulse), torch.from_numpy(separation))

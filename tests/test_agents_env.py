@@ -1,0 +1,98 @@
+"""Task environment: TorchRL's contract, true last observations, statistics."""
+
+import torch
+from fake_task import PointMass
+from tensordict import TensorDict
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import check_env_specs
+
+from dora.agents.env import EpisodeColumns, TaskEnv, ended_episodes
+
+
+def rollout(env: TaskEnv, steps: int) -> TensorDict:
+    torch.manual_seed(0)
+    return env.rollout(steps, break_when_any_done=False)
+
+
+def test_specs_hold():
+    check_env_specs(TaskEnv(PointMass(), seed=0))
+
+
+def test_the_true_last_observation_is_kept_and_only_ended_rows_restart():
+    env = TaskEnv(PointMass(4, max_steps=5), seed=0, stagger=True)
+    data = rollout(env, 12)
+    done = data["next", "done"][..., 0]
+    moved = (data["next", "observation"][..., :2] - data["observation"][..., :2]).abs()
+    assert moved.max() <= 0.15 + 1e-6  # one step, also where an episode ends
+    after = data["observation"][:, 1:] - data["next", "observation"][:, :-1]
+    jumped = after.abs().sum(-1) > 1e-6
+    assert torch.equal(jumped, done[:, :-1])
+    assert done.any(1).all()
+    assert not data["next", "terminated"].any()
+
+
+def test_the_short_path_equals_torchrl_own():
+    ours, theirs = (TaskEnv(PointMass(4, max_steps=5, fail_at=4), seed=1, stagger=True) for _ in range(2))
+    state, reference = ours.reset(), theirs.reset()
+    for _ in range(15):
+        action = torch.rand(4, 2) * 2 - 1
+        state["action"], reference["action"] = action, action
+        out, state = ours.step_and_maybe_reset(state)
+        expected, reference = EnvBase.step_and_maybe_reset(theirs, reference)
+        for key in expected["next"].keys():  # noqa: SIM118
+            assert torch.equal(out["next", key], expected["next", key]), key
+        for key in ("observation", "done", "terminated", "truncated", "statistics"):
+            assert torch.equal(state[key], reference[key]), key
+
+
+def test_failure_terminates_and_the_limit_truncates():
+    data = rollout(TaskEnv(PointMass(2, max_steps=5, fail_at=3), seed=0), 3)
+    assert data["next", "terminated"][:, 2].all()
+    assert not data["next", "truncated"].any()
+    data = rollout(TaskEnv(PointMass(2, max_steps=3), seed=0), 3)
+    assert data["next", "truncated"][:, 2].all()
+    assert not data["next", "terminated"].any()
+
+
+def test_statistics_are_those_of_the_episode():
+    task = PointMass(3, max_steps=6)
+    env = TaskEnv(task, seed=0)
+    data = rollout(env, 12)
+    ended = data["next", "statistics"][:, 5]
+    columns = env.columns
+    for name, value in {
+        "return": data["next", "reward"][:, :6, 0].sum(1),
+        "length": torch.full((3,), 6.0),
+        "reward/distance": -(data["next", "observation"][..., :2] - data["next", "observation"][..., 2:])
+        .norm(dim=-1)[:, :6]
+        .mean(1),
+    }.items():
+        torch.testing.assert_close(columns.column(ended, name), value)
+    assert columns.column(ended, "stage/approach").max() <= 1
+    assert (columns.column(data["next", "statistics"][:, 6], "length") == 1).all()
+
+
+def test_staggered_first_episodes_are_spread_and_not_counted():
+    env = TaskEnv(PointMass(64, max_steps=16), seed=3, stagger=True)
+    data = rollout(env, 48)
+    first = data["next", "done"][..., 0].float().argmax(1)
+    assert len(first.unique()) > 8
+    ended = ended_episodes(data["next", "done"], data["next", "statistics"], env.columns)
+    assert (env.columns.column(ended, "length") == 16).all()
+    assert len(ended) >= 64
+
+
+def test_actions_are_clipped():
+    task = PointMass(2)
+    env = TaskEnv(task, seed=0)
+    data = env.reset()
+    before = task.position.clone()
+    env.step(data.set("action", torch.full((2, 2), 9.0)))
+    torch.testing.assert_close(task.position - before, torch.full((2, 2), 0.15))
+
+
+def test_penetration_counts_as_the_deepest_and_success_as_the_last():
+    columns = EpisodeColumns.of(("penetration_mm", "success", "success_any_penetration", "reward/x"))
+    assert columns.last == ("success", "whole", "success_any_penetration")
+    assert columns.highest == ("penetration_mm",)
+    assert columns.total == ("return", "length", "reward/x")

@@ -1,0 +1,248 @@
+"""Whole runs on the fake task: learning, resuming, interruptions, workers."""
+
+import csv
+import dataclasses
+import functools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from fake_task import PointMass
+from torch import Tensor
+
+from dora.agents.checkpoint import read_checkpoint
+from dora.agents.collect import Rollouts
+from dora.agents.config import PPOConfig, RunConfig, SACConfig
+from dora.agents.logging import TAGS
+from dora.agents.play import evaluate_checkpoint, record
+from dora.agents.ppo import PPO
+from dora.agents.runfolder import RunFolder
+from dora.agents.trainer import Trainer
+from dora.errors import InputError
+
+RESULT_KEYS = [
+    *("env", "agent", "guidance", "seed", "env_steps", "wall_seconds", "env_steps_per_second", "episodes"),
+    *("success_rate", "zero_success_rate", "stage_rates", "return_mean", "penetration_max_mm"),
+    *("num_envs", "workers", "config_digest", "finished"),
+]
+
+BASE = RunConfig(
+    "Fake-v1", "ppo", "affordance", num_envs=16, workers=0, eval_envs=16, eval_episodes=16, final_episodes=40
+)
+SMALL_PPO = PPOConfig(rollout=16, minibatch=128, hidden=(32, 32))
+
+
+class Drifting(PointMass):
+    """A task that breaks after some steps."""
+
+    def step(self, action: Tensor) -> Any:
+        if int(self.elapsed_steps.max()) == 5:
+            raise InputError("The action of environment 3 is NaN: send finite numbers.")
+        return super().step(action)
+
+
+def run(path: Path, config: RunConfig, make: Any = PointMass, resume: bool = False) -> dict[str, Any]:
+    folder = RunFolder(path)
+    if not resume:
+        folder.create(config)
+    return Trainer(config, make, folder, resume=resume).run()
+
+
+def weights(path: Path) -> dict[str, Tensor]:
+    return read_checkpoint(RunFolder(path).latest).tensors
+
+
+def test_ppo_learns_and_leaves_a_complete_folder(tmp_path: Path):
+    config = dataclasses.replace(BASE, total_steps=40_000, eval_every=10_000)
+    result = run(tmp_path / "run", config)
+    assert list(result)[: len(RESULT_KEYS)] == RESULT_KEYS
+    assert json.loads((tmp_path / "run" / "result.json").read_text()) == result
+    assert result["success_rate"] > 0.9
+    assert result["zero_success_rate"] < 0.3
+    assert result["finished"]
+    assert result["stage_rates"].keys() == {"approach", "reach"}
+    with (tmp_path / "run" / "eval.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 40
+    assert sum(float(r["success"]) for r in rows) / 40 == pytest.approx(result["success_rate"])
+    assert {p.name for p in (tmp_path / "run").iterdir()} >= {"config.yaml", "versions.txt", "curve.csv"}
+    _, evaluation, zero = evaluate_checkpoint(RunFolder(tmp_path / "run").best, config, PointMass)
+    assert evaluation.success_rate == result["success_rate"]
+    assert zero is not None
+
+
+def test_sac_learns(tmp_path: Path):
+    learner = SACConfig(batch=128, updates_per_step=1 / 16, warmup=500, hidden=(64, 64), capacity=20_000)
+    config = dataclasses.replace(
+        BASE, agent="sac", guidance="none", total_steps=14_000, eval_every=3_500, learner=learner
+    )
+    result = run(tmp_path / "run", config)
+    assert result["success_rate"] > 0.9
+    assert result["zero_success_rate"] is None
+
+
+@pytest.mark.parametrize("agent", ["ppo", "sac"])
+def test_resuming_goes_on_exactly(tmp_path: Path, agent: str):
+    """Episodes end with the rollout and all start alike, so a restart of the environments changes nothing."""
+    learner = SMALL_PPO if agent == "ppo" else SACConfig(rollout=16, batch=64, warmup=100, hidden=(16, 16))
+    config = dataclasses.replace(
+        BASE, agent=agent, learner=learner, total_steps=4 * 256, eval_every=512, stagger=False
+    )
+    make = functools.partial(PointMass, deterministic=True)
+    run(tmp_path / "straight", config, make)
+    run(tmp_path / "halves", dataclasses.replace(config, total_steps=2 * 256), make)
+    run(tmp_path / "halves", config, make, resume=True)
+    straight, halves = weights(tmp_path / "straight"), weights(tmp_path / "halves")
+    assert straight.keys() == halves.keys()
+    for name, value in straight.items():
+        assert torch.equal(value, halves[name]), name
+    curves = [(tmp_path / name / "curve.csv").read_text().splitlines() for name in ("straight", "halves")]
+    assert [line.split(",")[2] for line in curves[0]] == [line.split(",")[2] for line in curves[1]]
+
+
+def test_same_seed_same_run_and_other_seed_another(tmp_path: Path):
+    config = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=1024, eval_every=512)
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        run(tmp_path / name, dataclasses.replace(config, seed=seed))
+    a, b, c = (weights(tmp_path / name)["actor/mean.0.weight"] for name in "abc")
+    assert torch.equal(a, b)
+    assert not torch.equal(a, c)
+
+
+def test_resume_refuses_other_settings(tmp_path: Path):
+    config = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=512)
+    run(tmp_path / "run", config)
+    with pytest.raises(InputError, match="digest"):
+        run(tmp_path / "run", dataclasses.replace(config, num_envs=8), resume=True)
+    with pytest.raises(InputError, match="holds a run already"):
+        run(tmp_path / "run", config)
+
+
+def test_stop_success_needs_two_evaluations_in_a_row(tmp_path: Path):
+    config = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=9999, eval_every=512, stop_success=0.0)
+    assert run(tmp_path / "run", config)["env_steps"] == 1024
+
+
+def test_worker_processes_learn_repeat_and_leave_nothing_behind(tmp_path: Path):
+    config = dataclasses.replace(BASE, workers=2, num_envs=8, learner=SMALL_PPO, total_steps=2048)
+    before = children()
+    results = [run(tmp_path / name, config) for name in "ab"]
+    assert results[0]["env_steps"] == 2048
+    a, b = (weights(tmp_path / name)["actor/mean.0.weight"] for name in "ab")
+    assert torch.equal(a, b)
+    assert children() == before
+
+
+def test_the_message_of_a_failing_worker_arrives():
+    learner = PPO(SMALL_PPO, 4, 2, 1000)
+    rollouts = Rollouts(
+        functools.partial(Drifting, 4), learner.policy,
+        workers=1, num_envs=4, rollout=8, seeds=[0], stagger=False,
+    )  # fmt: skip
+    with rollouts, pytest.raises(InputError, match="environment 3 is NaN"):
+        rollouts.collect()
+
+
+def children() -> set[str]:
+    """Python processes started by this one, but for the resource tracker."""
+    out = subprocess.run(
+        ["ps", "--ppid", str(os.getpid()), "-o", "pid=,args="], capture_output=True, text=True, check=True
+    ).stdout
+    return {line.strip() for line in out.splitlines() if "python" in line and "resource_tracker" not in line}
+
+
+SCRIPT = """
+import dataclasses, sys
+from pathlib import Path
+from fake_task import PointMass
+from dora.agents.runfolder import RunFolder
+from dora.agents.trainer import Trainer
+from test_agents_train import BASE, SMALL_PPO
+if __name__ == "__main__":
+    resume, total = sys.argv[2] == "resume", int(sys.argv[3])
+    config = dataclasses.replace(
+        BASE, workers=1, learner=SMALL_PPO, total_steps=total, eval_every=10**9, checkpoint_seconds=0.2
+    )
+    folder = RunFolder(Path(sys.argv[1]))
+    if not resume:
+        folder.create(config)
+    result = Trainer(config, PointMass, folder, resume=resume).run()
+    sys.exit(0 if result["finished"] else 130)
+"""
+
+
+def start(tmp_path: Path, mode: str, total: int) -> subprocess.Popen[bytes]:
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    root = Path(__file__).parent
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(root.parent)]), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(script), str(tmp_path / "run"), mode, str(total)]
+    return subprocess.Popen(command, env=env, stderr=subprocess.PIPE, start_new_session=True)
+
+
+def wait_for_checkpoint(process: subprocess.Popen[bytes], path: Path, newer_than: float) -> None:
+    deadline = time.monotonic() + 40
+    while not path.exists() or path.stat().st_mtime <= newer_than:
+        assert process.poll() is None, process.stderr and process.stderr.read().decode()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def session_is_empty(session: int) -> bool:
+    out = subprocess.run(
+        ["ps", "-s", str(session), "-o", "pid=,stat="], capture_output=True, text=True
+    ).stdout
+    return all("Z" in line.split()[1] for line in out.splitlines() if line.strip())
+
+
+def test_kill_then_resume_then_ctrl_c(tmp_path: Path):
+    folder = RunFolder(tmp_path / "run")
+    process = start(tmp_path, "new", 10**9)
+    wait_for_checkpoint(process, folder.latest, 0.0)
+    process.kill()
+    process.communicate()
+    killed = read_checkpoint(folder.latest).progress["env_steps"]
+    assert killed > 0
+    time.sleep(2.0)
+    assert session_is_empty(process.pid)
+
+    process = start(tmp_path, "resume", 10**9)
+    wait_for_checkpoint(process, folder.latest, folder.latest.stat().st_mtime)
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 130, errors.decode()
+    assert "Traceback" not in errors.decode()
+    result = json.loads((folder.path / "result.json").read_text())
+    assert not result["finished"]
+    assert result["env_steps"] > killed
+    assert list(result)[: len(RESULT_KEYS)] == RESULT_KEYS
+    assert session_is_empty(process.pid)
+
+
+def test_every_tag_written_is_explained(tmp_path: Path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    config = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=1024, eval_every=512)
+    run(tmp_path / "run", config)
+    events = EventAccumulator(str(tmp_path / "run"))
+    events.Reload()
+    tags = events.Tags()["scalars"]
+    assert {"loss/policy", "episode/reward/distance", "evaluation/stage/reach", "speed/learn_share"} <= set(
+        tags
+    )
+    families = ("episode/reward/", "episode/stage/", "evaluation/stage/", "episode/")
+    unexplained = [t for t in tags if t not in TAGS and not t.startswith(families)]
+    assert not unexplained
+
+
+def test_a_film_is_written(tmp_path: Path):
+    path = tmp_path / "video" / "a.mp4"
+    record(functools.partial(PointMass, 1), lambda o: torch.zeros(len(o), 2), path, episodes=1)
+    assert path.stat().st_size > 500

@@ -1,0 +1,95 @@
+"""The wrist controller follows paths, respects limits and never yields NaN."""
+
+from collections.abc import Iterator
+from math import pi
+
+import pytest
+import torch
+
+import dora.tasks as tasks
+from dora.robot.rotations import quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
+from dora.sim.controllers import LIMIT_MARGIN
+from dora.tasks.base import DoraEnv
+from dora.tasks.guidance import wrist_step
+
+PATH_STEPS = 60
+PATH_RADIUS = 0.06
+"""Radius of the circle that the wrist follows [m]."""
+PATH_TILT = 0.25
+"""Largest tilt along the path [rad]."""
+
+
+@pytest.fixture(scope="module")
+def task() -> Iterator[DoraEnv]:
+    task = tasks.make_task("DoraCube-v1", 4, guidance="none", preset="none")
+    yield task
+    task.close()
+
+
+def command(task: DoraEnv, wrist: torch.Tensor) -> torch.Tensor:
+    hand = task.agent.controller.hand_action(task.snapshot.hand_target)
+    return torch.cat([wrist, hand], -1)
+
+
+def test_the_wrist_follows_a_path(task: DoraEnv, record_property):
+    task.reset(seed=0)
+    start_p, start_q = task.snapshot.wrist_p.clone(), task.snapshot.wrist_q.clone()
+    controller, shifts, turns = task.agent.controller, [], []
+    for t in range(PATH_STEPS + 8):
+        phase = torch.tensor(2 * pi * min(t, PATH_STEPS) / PATH_STEPS)
+        goal_p = start_p + PATH_RADIUS * torch.stack([phase.cos() - 1, phase.sin(), phase.sin() / 2])
+        tilt = torch.stack([phase.sin(), torch.zeros(()), 1 - phase.cos()]) * PATH_TILT
+        goal_q = quaternion_multiply(quaternion_from_rotation_vector(tilt).expand(4, 4), start_q)
+        step = wrist_step(goal_p, goal_q, *controller.wrist(), controller.wrist_limits)
+        task.step(command(task, step))
+        s = task.snapshot
+        shifts.append((s.wrist_p - goal_p).norm(dim=-1).max() * 1000)
+        turns.append(torch.rad2deg(rotation_angle(s.wrist_q, goal_q).max()))
+    shift, turn = torch.stack(shifts), torch.stack(turns)
+    record_property("tracking", f"moving {shift.max():.1f} mm {turn.max():.1f} deg, at rest {shift[-1]:.2f} mm")
+    print(f"tracking: moving {shift.max():.1f} mm, {turn.max():.1f} deg; rest {shift[-1]:.2f} mm, {turn[-1]:.2f} deg")
+    assert shift.max() < 15
+    assert turn.max() < 5
+    assert shift[-1] < 1.0
+    assert turn[-1] < 0.5
+
+
+@pytest.mark.parametrize("direction", [0, 1, 2])
+def test_out_of_reach_and_singular_poses_stay_finite_and_within_limits(task: DoraEnv, direction: int):
+    task.reset(seed=0)
+    arm, controller = task.agent.description.arm, task.agent.controller
+    push = torch.zeros(4, 6)
+    push[:, direction] = torch.tensor([1.0, -1.0, 1.0, -1.0])
+    push[2:, 3 + direction] = 1.0
+    speed = torch.tensor(arm.velocity, dtype=torch.float32) / task.CONTROL_FREQUENCY
+    for _ in range(70):
+        before = controller.target[:, :7].clone()
+        task.step(command(task, push))
+        moved = (controller.target[:, :7] - before).abs()
+        assert torch.isfinite(controller.target).all()
+        assert (moved <= speed + 1e-4).all()
+    lower, upper = (torch.tensor(x, dtype=torch.float32) for x in (arm.lower, arm.upper))
+    assert (controller.target[:, :7] >= lower + LIMIT_MARGIN - 1e-5).all()
+    assert (controller.target[:, :7] <= upper - LIMIT_MARGIN + 1e-5).all()
+    assert torch.isfinite(task.snapshot.arm_q).all()
+
+
+def test_hand_targets_reach_what_was_asked_no_faster_than_allowed(task: DoraEnv):
+    task.reset(seed=0)
+    controller, hand = task.agent.controller, task.agent.description.hand
+    action = torch.zeros(4, task.action_size)
+    action[:, 6:] = 1.0
+    limit = torch.tensor(hand.velocity, dtype=torch.float32) / task.CONTROL_FREQUENCY
+    for _ in range(12):
+        before = controller.target[:, 7:].clone()
+        task.step(action)
+        assert ((controller.target[:, 7:] - before).abs() <= limit + 1e-5).all()
+    torch.testing.assert_close(controller.target[0, 7:], torch.tensor(hand.upper, dtype=torch.float32))
+
+
+def test_an_action_asks_for_the_joints_it_was_made_from(task: DoraEnv):
+    controller = task.agent.controller
+    joints = torch.rand(3, 20) * (controller.hand_upper - controller.hand_lower) + controller.hand_lower
+    action = controller.hand_action(joints)
+    back = controller.hand_lower + (action / 2 + 0.5) * (controller.hand_upper - controller.hand_lower)
+    torch.testing.assert_close(back, joints)
