@@ -1,43 +1,40 @@
 """Measure how fast the parts of Dora are: python experiments/bench.py env --env PickCube-v1 --json"""
 
+import dataclasses
 import json
 import sys
-from dataclasses import dataclass, field
-from typing import Annotated
 
 import tyro
 
 from dora.errors import InputError
 from dora.sim import benchmark
 
-
-@dataclass
-class Env:
-    """Environment steps per second with random actions, against gymnasium's AsyncVectorEnv of single environments."""
-
-    env: str = "PickCube-v1"
-    """Task: any ManiSkill id."""
-    num_envs: int = 64
-    """Environments in each process."""
-    workers: int = field(default_factory=benchmark.all_cores)
-    """Processes (default: one per core)."""
-    seconds: float = 10.0
-    """Length of each measurement [s]."""
-    json: bool = False
-    """Print one JSON object on the last line instead of a table."""
-
-    def run(self) -> dict:
-        """Measure; the result as JSON-ready values."""
-        return benchmark.measure(self.env, self.num_envs, self.workers, self.seconds).as_dict()
+app = tyro.extras.SubcommandApp()
 
 
-Command = Annotated[Env, tyro.conf.subcommand("env")]
+@app.command(name="env")
+def bench_env(
+    env: str = "PickCube-v1",
+    num_envs: int = 64,
+    workers: int = benchmark.all_cores(),
+    seconds: float = 10.0,
+    json: bool = False,
+) -> None:
+    """Environment steps per second with random actions, against an AsyncVectorEnv of single environments.
+
+    Args:
+        env: task, any ManiSkill id.
+        num_envs: environments in each process.
+        workers: processes (default: one per core).
+        seconds: length of each of the four measurements [s].
+        json: print one JSON object on the last line instead of a table.
+    """
+    report(dataclasses.asdict(benchmark.measure(env, num_envs, workers, seconds)), json)
 
 
-def main(command: tyro.conf.OmitSubcommandPrefixes[Command]) -> None:
-    """Run a benchmark and print its result."""
-    result = command.run()
-    if command.json:
+def report(result: dict, as_json: bool) -> None:
+    """Print a result as a table or as one line of JSON."""
+    if as_json:
         print(json.dumps(result))
     else:
         for name, value in result.items():
@@ -46,7 +43,7 @@ def main(command: tyro.conf.OmitSubcommandPrefixes[Command]) -> None:
 
 if __name__ == "__main__":
     try:
-        tyro.cli(main, description=__doc__)
+        app.cli(description=__doc__)
     except InputError as error:
         print(error, file=sys.stderr)
         sys.exit(2)

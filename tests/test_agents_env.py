@@ -11,7 +11,9 @@ from dora.agents.env import EpisodeColumns, TaskEnv, ended_episodes
 
 def rollout(env: TaskEnv, steps: int) -> TensorDict:
     torch.manual_seed(0)
-    return env.rollout(steps, break_when_any_done=False)
+    data = env.rollout(steps, break_when_any_done=False)
+    assert isinstance(data, TensorDict)
+    return data
 
 
 def test_specs_hold():
@@ -27,7 +29,7 @@ def test_the_true_last_observation_is_kept_and_only_ended_rows_restart():
     after = data["observation"][:, 1:] - data["next", "observation"][:, :-1]
     jumped = after.abs().sum(-1) > 1e-6
     assert torch.equal(jumped, done[:, :-1])
-    assert done.any(1).all()
+    assert done.sum(1).min() >= 1
     assert not data["next", "terminated"].any()
 
 
@@ -60,12 +62,11 @@ def test_statistics_are_those_of_the_episode():
     data = rollout(env, 12)
     ended = data["next", "statistics"][:, 5]
     columns = env.columns
+    away = data["next", "observation"][..., :2] - data["next", "observation"][..., 2:]
     for name, value in {
         "return": data["next", "reward"][:, :6, 0].sum(1),
         "length": torch.full((3,), 6.0),
-        "reward/distance": -(data["next", "observation"][..., :2] - data["next", "observation"][..., 2:])
-        .norm(dim=-1)[:, :6]
-        .mean(1),
+        "reward/distance": -torch.linalg.vector_norm(away[:, :6], dim=-1).mean(1),
     }.items():
         torch.testing.assert_close(columns.column(ended, name), value)
     assert columns.column(ended, "stage/approach").max() <= 1

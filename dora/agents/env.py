@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-import gymnasium as gym
 import torch
 from jaxtyping import Bool, Float, Int
 from tensordict import TensorDict, TensorDictBase
@@ -25,7 +24,7 @@ class Task(Protocol):
 
     num_envs: int
     device: torch.device
-    single_action_space: gym.spaces.Box
+    single_action_space: Any  # a gymnasium Box in [-1, 1]
     elapsed_steps: Int[Tensor, " n"]
     max_steps: int
     logged: tuple[str, ...]

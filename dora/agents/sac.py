@@ -60,7 +60,7 @@ class SAC:
 
     def counters(self) -> dict[str, float]:
         """Gradient steps taken and due, transitions seen."""
-        return {"updates": self.updates, "due": self.due, "added": self.replay.added}
+        return {"updates": float(self.updates), "due": self.due, "added": float(self.replay.added)}
 
     def set_counters(self, counters: dict[str, float]) -> None:
         """Restore `counters`."""

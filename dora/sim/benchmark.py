@@ -4,7 +4,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
@@ -24,16 +24,17 @@ _ACTIONS_DRAWN = 64
 _WARM_UP_STEPS = 10
 _START_TIMEOUT = 300.0
 """Longest time to build all environments [s]."""
-_TASK = {"obs_mode": "state", "render_backend": "none"}
+_TASK: dict[str, Any] = {"obs_mode": "state", "render_backend": "none"}
 
 
 @dataclass(frozen=True)
 class EnvReport:
     """Result of `measure`.
 
-    ``ratio`` is ``env_steps_per_second`` over ``reference_env_steps_per_second``; ``physics_share`` the part of our
-    step that is PhysX; ``shares`` all parts (``other`` is torch, ManiSkill and resets); ``cpu_microseconds`` the
-    processor time of one environment step; ``seconds`` the length of each measurement.
+    ``ratio`` is ``env_steps_per_second`` over ``reference_env_steps_per_second``; ``physics_share`` the
+    part of our step that is PhysX; ``shares`` all parts (``other`` is torch, ManiSkill and resets);
+    ``cpu_microseconds`` the processor time of one environment step; ``seconds`` the length of each
+    measurement.
     """
 
     env: str
@@ -47,10 +48,6 @@ class EnvReport:
     reference_processes: int
     cpu_microseconds: float
     shares: dict[str, float] = field(default_factory=dict)
-
-    def as_dict(self) -> dict[str, Any]:
-        """The report as JSON-ready values."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -116,10 +113,10 @@ def _run_workers(env_id: str, num_envs: int, workers: int, seconds: float) -> li
 
 def _work(env_id: str, num_envs: int, seed: int, seconds: float, barrier: Any, results: Any) -> None:
     torch.set_num_threads(1)
-    env = gym.make(env_id, num_envs=num_envs, sim_backend=BACKEND, **_TASK)
+    env: Any = gym.make(env_id, num_envs=num_envs, sim_backend=BACKEND, **_TASK)
     step = _random_stepper(env, num_envs, seed)
     profile = StepProfile()
-    env.unwrapped.scene.px.profile = profile  # type: ignore[attr-defined]
+    env.unwrapped.scene.px.profile = profile
     for _ in range(_WARM_UP_STEPS):
         step()
     barrier.wait(_START_TIMEOUT)
@@ -130,7 +127,7 @@ def _work(env_id: str, num_envs: int, seed: int, seconds: float, barrier: Any, r
     env.close()
 
 
-def _random_stepper(env: gym.Env, num_envs: int, seed: int) -> Callable[[], None]:
+def _random_stepper(env: Any, num_envs: int, seed: int) -> Callable[[], None]:
     """A function that makes one random step and resets the environments whose episode ended."""
     env.action_space.seed(seed)
     actions = [env.action_space.sample() for _ in range(_ACTIONS_DRAWN)]
@@ -162,7 +159,8 @@ def _single_env(env_id: str) -> gym.Env:
 
 
 def _reference_rate(env_id: str, processes: int, seconds: float) -> float:
-    """Environment steps per second of an `AsyncVectorEnv`, which resets ended episodes within the step as ours does."""
+    """Environment steps per second of an `AsyncVectorEnv`, which resets ended episodes within the step as
+    ours does."""
     makers = [lambda: _single_env(env_id)] * processes
     env = AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
     try:

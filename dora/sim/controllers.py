@@ -10,6 +10,7 @@ import torch
 from gymnasium import spaces
 from jaxtyping import Float, Int
 from mani_skill.agents.controllers.base_controller import BaseController, ControllerConfig
+from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController, PDJointPosControllerConfig
 from torch import Tensor
 
 from dora.robot.description import RobotDescription
@@ -52,6 +53,7 @@ class WristHandController(BaseController):
         self.hand_upper = torch.tensor(robot.hand.upper, dtype=f32, device=self.device)
         self.hand_step = torch.tensor(robot.hand.velocity, dtype=f32, device=self.device) * self.dt
         self.target: Tensor = torch.empty(0)
+        self._begun = False
 
     def _initialize_action_space(self) -> None:
         size = 6 + self.hand_size
@@ -79,13 +81,21 @@ class WristHandController(BaseController):
                 for part in joint._objs:
                     part.set_armature(np.array([group.armature[i]], np.float32))
 
-    def reset(self) -> None:
-        """Commands the measured posture in the environments that are being reset."""
-        q = self.qpos
+    def begin(self, rows: Int[Tensor, " b"], joints: Float[Tensor, "b 27"]) -> None:
+        """Commands `joints` (arm, hand) [rad] in the environments `rows` at the start of their episodes.
+
+        ManiSkill calls `reset` for all environments even in a partial reset; the call that follows does nothing.
+        """
         if len(self.target) == 0:
-            self.target = q.clone()
-        mask = self.scene._reset_mask
-        self.target[mask] = q[mask]
+            self.target = self.qpos.clone()
+        self.target[rows] = joints
+        self._begun = True
+
+    def reset(self) -> None:
+        """Commands the measured posture, unless `begin` has just said what to command."""
+        if not self._begun:
+            self.target = self.qpos.clone()
+        self._begun = False
 
     def expand_hand(self, hand: Float[Tensor, "n h"]) -> Float[Tensor, "n 20"]:
         """Values of the action's hand components -> values of all hand joints, followers equal to leaders."""
@@ -141,3 +151,39 @@ class WristHandConfig(ControllerConfig):
     robot: RobotDescription
     coupled: bool = False
     controller_cls = WristHandController
+
+
+class CoupledJointPosController(PDJointPosController):
+    """ManiSkill's joint position controller for the actuated joints only; coupled joints follow in the command.
+
+    (ManiSkill's own mimic controller wants every joint to be a leader or a follower.)
+    """
+
+    config: "CoupledJointPosConfig"
+
+    def _initialize_joints(self) -> None:
+        super()._initialize_joints()
+        arm = len(self.config.robot.arm)
+        hand = torch.from_numpy(self.config.robot.hand_actuated).to(self.device) + arm
+        self.actuated = torch.cat([torch.arange(arm, device=self.device), hand])
+        self.arm_size = arm
+
+    def _get_joint_limits(self) -> np.ndarray:
+        return super()._get_joint_limits()[self.actuated.cpu().numpy()]
+
+    def set_action(self, action: Float[Tensor, "n a"]) -> None:
+        """Sends absolute targets [rad], or targets relative to the measured joints."""
+        asked = self._preprocess_action(action)
+        if self.config.use_delta:
+            asked = self.qpos[:, self.actuated] + asked
+        hand = self.config.robot.expand_hand(asked[:, self.arm_size :])
+        self._target_qpos = torch.cat([asked[:, : self.arm_size], hand], -1)
+        self.set_drive_targets(self._target_qpos)
+
+
+@dataclass(kw_only=True)
+class CoupledJointPosConfig(PDJointPosControllerConfig):
+    """Configuration of `CoupledJointPosController`; joints are the arm's, then the hand's."""
+
+    robot: RobotDescription
+    controller_cls = CoupledJointPosController

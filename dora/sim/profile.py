@@ -19,7 +19,7 @@ class StepProfile:
 
     def clear(self) -> None:
         """Start again from zero."""
-        self.seconds = dict.fromkeys(PARTS, 0.0)
+        self.seconds: dict[str, float] = {part: 0.0 for part in PARTS}
         self._last = self._started = time.perf_counter()
 
     def mark(self) -> None:

@@ -5,6 +5,8 @@ from typing import Any
 
 import sapien
 from mani_skill.utils.building import _mjcf_loader
+from sapien import pysapien
+from sapien.wrapper import urdf_loader
 
 
 class NoMaterial:
@@ -33,7 +35,7 @@ def can_render() -> bool:
         # The render system must come before any material: SAPIEN binds to the device of the first it meets.
         sapien.render.RenderSystem(sapien.Device("cpu"))
     except RuntimeError:
-        for module in (sapien.render, _mjcf_loader):
+        for module in (sapien.render, pysapien.render, urdf_loader, _mjcf_loader):
             vars(module)["RenderMaterial"] = NoMaterial
         return False
     return True

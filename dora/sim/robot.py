@@ -6,10 +6,7 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
-from mani_skill.agents.controllers.pd_joint_pos import (
-    PDJointPosControllerConfig,
-    PDJointPosMimicControllerConfig,
-)
+from mani_skill.agents.controllers.pd_joint_pos import PDJointPosControllerConfig
 from mani_skill.agents.registration import REGISTERED_AGENTS, register_agent
 from mani_skill.utils.structs import Link
 from sapien.physx import PhysxMaterial
@@ -19,8 +16,10 @@ from dora.errors import InputError
 from dora.robot import RobotDescription, available_robots, load_robot
 from dora.robot.kinematics import SerialChain
 from dora.robot.rotations import quaternion_from_matrix
-from dora.sim.controllers import WristHandConfig
+from dora.sim.controllers import CoupledJointPosConfig, WristHandConfig
 
+CONTROL_MODES = ("wrist_delta_hand_pos", "pd_joint_pos", "pd_joint_delta_pos")
+"""Control modes of every robot, the default first; each exists with the suffix COUPLED as well."""
 COUPLED = "_coupled"
 """Suffix of the control modes that enforce the hand's couplings."""
 JOINT_DELTA = 0.1
@@ -51,9 +50,7 @@ class DescribedRobot(BaseAgent):
     def _add_shapes(self, link: Any) -> None:
         contact = self.description.contacts.get(link.name)
         for shape in self.description.shapes.get(link.name, ()):
-            material = (
-                PhysxMaterial(contact.friction, contact.friction, contact.restitution) if contact else None
-            )
+            material = PhysxMaterial(contact.friction, contact.friction, contact.restitution) if contact else None
             pose = sapien.Pose(shape.position, shape.quaternion)
             if shape.kind == "box":
                 link.add_box_collision(pose, list(shape.size), material)
@@ -80,8 +77,7 @@ class DescribedRobot(BaseAgent):
         self.hand_index = [self.robot.active_joints_map[n].active_index[0].item() for n in d.hand.names]
         self.arm_index = [self.robot.active_joints_map[n].active_index[0].item() for n in d.arm.names]
         self.keyframes = {
-            name: Keyframe(pose=sapien.Pose(), qpos=self.qpos_of(p.arm, p.hand))
-            for name, p in d.postures.items()
+            name: Keyframe(pose=sapien.Pose(), qpos=self.qpos_of(p.arm, p.hand)) for name, p in d.postures.items()
         }
 
     def qpos_of(self, arm: np.ndarray, hand: np.ndarray) -> np.ndarray:
@@ -104,30 +100,17 @@ class DescribedRobot(BaseAgent):
             key: [*getattr(d.arm, source), *getattr(d.hand, source)]
             for key, source in (("stiffness", "stiffness"), ("damping", "damping"), ("force_limit", "effort"))
         }
-        mimic = {
-            d.hand.names[c.follower]: {
-                "joint": d.hand.names[c.leader],
-                "multiplier": c.multiplier,
-                "offset": c.offset,
-            }
-            for c in d.couplings
-        }
-        position = {"lower": None, "upper": None, **gains}
+        absolute = {"normalize_action": False, "lower": None, "upper": None, **gains}
         delta = {"lower": -JOINT_DELTA, "upper": JOINT_DELTA, "use_delta": True, **gains}
-        modes: dict[str, Any] = {
-            "wrist_delta_hand_pos": WristHandConfig(names, robot=d),
-            "pd_joint_pos": PDJointPosControllerConfig(names, normalize_action=False, **position),
-            "pd_joint_delta_pos": PDJointPosControllerConfig(names, **delta),
-            f"wrist_delta_hand_pos{COUPLED}": WristHandConfig(names, robot=d, coupled=True),
+        wrist, absolute_mode, delta_mode = CONTROL_MODES
+        return {
+            wrist: WristHandConfig(names, robot=d),
+            absolute_mode: PDJointPosControllerConfig(names, **absolute),
+            delta_mode: PDJointPosControllerConfig(names, **delta),
+            wrist + COUPLED: WristHandConfig(names, robot=d, coupled=True),
+            absolute_mode + COUPLED: CoupledJointPosConfig(names, robot=d, **absolute),
+            delta_mode + COUPLED: CoupledJointPosConfig(names, robot=d, **delta),
         }
-        if mimic:
-            modes[f"pd_joint_pos{COUPLED}"] = PDJointPosMimicControllerConfig(
-                names, normalize_action=False, mimic=mimic, **position
-            )
-            modes[f"pd_joint_delta_pos{COUPLED}"] = PDJointPosMimicControllerConfig(
-                names, mimic=mimic, **delta
-            )
-        return modes
 
 
 def register_robot(name: str) -> type[DescribedRobot]:
@@ -139,9 +122,7 @@ def register_robot(name: str) -> type[DescribedRobot]:
     if name in REGISTERED_AGENTS:
         cls = REGISTERED_AGENTS[name].agent_cls
         if not issubclass(cls, DescribedRobot):
-            raise InputError(
-                f"the robot {name!r} is ManiSkill's own and has no description in robots/; rename yours"
-            )
+            raise InputError(f"the robot {name!r} is ManiSkill's own and has no description in robots/; rename yours")
         return cls
     description = load_robot(name)
     title = "".join(part.capitalize() for part in name.split("_"))

@@ -89,8 +89,8 @@ class DoraEnv(BaseEnv):
         """Grasps of the task's object."""
 
     @abstractmethod
-    def load_object(self) -> Actor:
-        """Builds the object into every sub-scene, and sets `object_half` (n, 3) [m]."""
+    def load_object(self, scale: np.ndarray) -> Actor:
+        """Builds the object into every sub-scene, `scale` (n,) times its nominal size; sets `object_half` (n, 3) [m]."""
 
     @abstractmethod
     def place(self, env_idx: Tensor, u: Tensor) -> None:
@@ -117,6 +117,7 @@ class DoraEnv(BaseEnv):
         )  # fmt: skip
         self.guided, self.preset = options.guided, options.preset
         self._snapshot: Snapshot | None = None
+        self._forced_scale: Tensor | None = None
         super().__init__(
             *args,
             num_envs=num_envs,
@@ -155,7 +156,8 @@ class DoraEnv(BaseEnv):
 
     def _load_scene(self, options: dict) -> None:
         self.table = add_table(self.scene)
-        self.target_object = self.load_object()
+        self.scale = self._forced_scale if self._forced_scale is not None else self._draw_scale()
+        self.target_object = self.load_object(self.scale.cpu().numpy())
         agent, device, n = self.agent, self.device, self.num_envs
         self.machine = StageMachine(self.STAGES, n, device)
         self.reference = GraspReference(self.candidates(), n, self.action_size, device)
@@ -176,6 +178,11 @@ class DoraEnv(BaseEnv):
         self._hand_index = torch.tensor(agent.hand_index, device=device)
         self._arm_index = torch.tensor(agent.arm_index, device=device)
         self._home = agent.posture_wrist("home")
+
+    def _draw_scale(self) -> Tensor:
+        """(n,) relative sizes, one draw from each environment's own stream."""
+        share = np.asarray(self._batched_episode_rng.uniform(size=(1,))).reshape(-1)
+        return torch.tensor(1 + self.preset.size * (2 * share - 1), dtype=torch.float32, device=self.device)
 
     @property
     def action_size(self) -> int:
@@ -235,19 +242,18 @@ class DoraEnv(BaseEnv):
     # ------------------------------------------------------------------ reset
 
     def reset(self, seed: Any = None, options: dict | None = None) -> tuple[Any, dict]:
-        """As in ManiSkill; a partial reset (`options["env_idx"]`) takes no seed.
+        """As in ManiSkill, but a seeded reset builds the scene anew: PhysX remembers earlier contacts, and would
+        not repeat a trajectory bit for bit otherwise. A partial reset (`options["env_idx"]`) takes no seed.
 
         Raises:
             InputError: if a seed comes together with `env_idx`, since ManiSkill would reseed every environment.
         """
         if seed is not None and options and "env_idx" in options:
-            raise InputError(
-                "a partial reset (env_idx) cannot take a seed: it would reseed every environment"
-            )
-        gym.Env.reset(
-            self, seed=seed[0] if isinstance(seed, list | tuple) else seed
-        )  # gymnasium's own generator
+            raise InputError("a partial reset (env_idx) cannot take a seed: it would reseed every environment")
+        gym.Env.reset(self, seed=seed[0] if isinstance(seed, list | tuple) else seed)  # gymnasium's own generator
         self._snapshot = None
+        if seed is not None and "reset_to_env_states" not in (options or {}):
+            options = {**(options or {}), "reconfigure": True}
         return super().reset(seed=seed, options=options)
 
     def _initialize_episode(self, env_idx: Tensor, options: dict) -> None:
@@ -259,6 +265,9 @@ class DoraEnv(BaseEnv):
         home = self.agent.description.postures["home"]
         qpos = torch.from_numpy(self.agent.qpos_of(home.arm, home.hand)).to(self.device)
         self.agent.robot.set_qpos(qpos.expand(len(env_idx), -1))
+        if isinstance(self.agent.controller, WristHandController):
+            joints = torch.tensor(np.concatenate([home.arm, home.hand]), dtype=torch.float32, device=self.device)
+            self.agent.controller.begin(env_idx, joints.expand(len(env_idx), -1))
         self.place(env_idx, place)
         pose, e, rows = self.target_object.pose, self.episode, len(env_idx)
         e.begin(env_idx, pose.p[env_idx])
@@ -290,7 +299,10 @@ class DoraEnv(BaseEnv):
         self.machine.advance(s)
         self.reference.advance(s)
         self._snapshot = replace(
-            s, stage=self.machine.index.clone(), phase=self.reference.phase.index.clone()
+            s,
+            stage=self.machine.index.clone(),
+            phase=self.reference.phase.index.clone(),
+            time=(self._elapsed_steps + 1) / self.MAX_STEPS,  # ManiSkill counts the step after this method
         )
         return action
 
@@ -395,7 +407,7 @@ class DoraEnv(BaseEnv):
 
     def get_state_dict(self) -> dict:
         """Simulator, controller and task state; a round trip restores stage and observation."""
-        task = self.episode.get_state() | {"elapsed": self._elapsed_steps.clone()}
+        task = self.episode.get_state() | {"elapsed": self._elapsed_steps.clone(), "scale": self.scale.clone()}
         return super().get_state_dict() | {
             "task": task,
             "machine": self.machine.get_state(),
@@ -403,8 +415,13 @@ class DoraEnv(BaseEnv):
         }
 
     def set_state_dict(self, state: dict, env_idx: Tensor | None = None) -> None:
-        """Inverse of `get_state_dict`; with `env_idx` (b,) the state has b rows."""
+        """Inverse of `get_state_dict`; with `env_idx` (b,) the state has b rows.
+
+        Where the state's objects have another size, the scene is built anew with those sizes.
+        """
         rows = torch.arange(self.num_envs, device=self.device) if env_idx is None else env_idx
+        if "task" in state:
+            self._rebuild(state["task"]["scale"].reshape(-1), rows)
         super().set_state_dict({k: state[k] for k in ("actors", "articulations")}, env_idx)
         controller = self.agent.controller
         if "controller" in state and isinstance(controller, WristHandController):
@@ -416,3 +433,14 @@ class DoraEnv(BaseEnv):
             self.reference.set_state(state["reference"], rows)
             self._apply_properties(rows)
         self._snapshot = None
+
+    def _rebuild(self, scale: Tensor, rows: Tensor) -> None:
+        """Gives the objects of the environments `rows` the sizes `scale` (b,), keeping everybody's state."""
+        if torch.equal(self.scale[rows], scale):
+            return
+        keep = self.get_state_dict()
+        keep["task"]["scale"][rows] = scale
+        self._forced_scale = keep["task"]["scale"]
+        super().reset(options={"reconfigure": True})
+        self._forced_scale = None
+        self.set_state_dict(keep)

@@ -35,7 +35,7 @@ HOLD = 10
 """Control steps the lifted cube must be held."""
 DEEPEST = 0.003
 """Penetration above which an episode does not count as a success [m]."""
-HAND_CENTRE = (0.041, 0.006, 0.153)
+HAND_CENTRE = (0.061, 0.005, 0.168)
 """Where a grasped cube's centre lies in the hand frame [m]."""
 ALPHA = 4.0
 """Spatial sensitivity of the affordance reward [1/m]."""
@@ -116,9 +116,7 @@ TERMS: Terms[Snapshot] = Terms(
     {
         "affordance": Term(_affordance, 0.3, "affordance", True, "exp(-alpha * sum of fingertip distances)"),
         "candidate": Term(_candidate, 0.3, "task", True, "closeness of the wrist to the candidate"),
-        "reach": Term(
-            lambda s: closeness(_reach(s), 0.0, 0.25), 0.3, doc="thumb and one finger near the cube"
-        ),
+        "reach": Term(lambda s: closeness(_reach(s), 0.0, 0.25), 0.3, doc="thumb and one finger near the cube"),
         "grasp": Term(_grasp, 0.4, doc="contacts: thumb against a finger, and how many fingers"),
         "lift": Term(_lift, 3.0, doc="rise, saturating at the target height"),
         "held": Term(lambda s: _held(s).float(), 1.5, doc="lifted, opposed and off the table"),
@@ -135,9 +133,7 @@ def _paper_affordance(s: Snapshot) -> Tensor:
 
 PAPER_TERMS: Terms[Snapshot] = Terms(
     {
-        "affordance": Term(
-            _paper_affordance, 1.0, "affordance", True, "exp(-alpha sum ||p_tip - p_afford||)"
-        ),
+        "affordance": Term(_paper_affordance, 1.0, "affordance", True, "exp(-alpha sum ||p_tip - p_afford||)"),
         "grasp": Term(
             lambda s: torch.exp((s.wrist_p - s.goal_p)[:, 2].clamp(max=0)) * (s.stage < 2),
             1.0,
@@ -149,9 +145,7 @@ PAPER_TERMS: Terms[Snapshot] = Terms(
             1.0,
             doc="exp(z - z_0), saturating",
         ),
-        "penalty": Term(
-            lambda s: s.action.square().mean(-1).clamp(max=1), -0.1, "penalty", doc="sum of action^2"
-        ),
+        "penalty": Term(lambda s: s.action.square().mean(-1).clamp(max=1), -0.1, "penalty", doc="sum of action^2"),
     }
 )
 
@@ -159,21 +153,15 @@ PAPER_TERMS: Terms[Snapshot] = Terms(
 # frame [m], and finger postures (proximal, medial of the four fingers; the same of the thumb) [rad].
 HAND_MADE = (
     {
-        "pitch": 0.82,
-        "centre": HAND_CENTRE,
-        "open": (0.18, 0.17, 0.0, 0.31),
-        "closed": (0.72, 0.25, 0.37, 0.0),
-    },
-    {
-        "pitch": 1.05,
-        "centre": (0.045, 0.006, 0.155),
-        "open": (0.18, 0.17, 0.0, 0.31),
-        "closed": (0.74, 0.25, 0.37, 0.0),
+        "pitch": 0.892,
+        "centre": (0.061, 0.005, 0.168),
+        "open": (0.091, 0.052, 0.0, 0.358),
+        "closed": (0.887, 0.215, 0.354, 0.0),
     },
 )
-THUMB_ABDUCTION = -0.08
+THUMB_ABDUCTION = -0.003
 """Abduction of the thumb in the hand-made candidates [rad]."""
-SPREAD_FINGERS = (0.0, -0.0, 0.0, 0.0)
+SPREAD_FINGERS = (-0.028, -0.009, 0.009, 0.028)
 """Abduction of index, middle, ring and pinky [rad]."""
 
 
@@ -233,9 +221,8 @@ class CubeEnv(DoraEnv):
     def candidates(self) -> GraspCandidates:
         return hand_made_candidates()
 
-    def load_object(self) -> Actor:
-        share = np.asarray(self._batched_episode_rng.uniform(size=(1,))).reshape(-1)
-        halves = HALF * (1 + self.preset.size * (2 * share - 1))
+    def load_object(self, scale: np.ndarray) -> Actor:
+        halves = HALF * scale
         cubes = []
         for i, half in enumerate(halves.tolist()):
             builder = self.scene.create_actor_builder()

@@ -26,13 +26,9 @@ def tables(task: DoraEnv) -> str:
     for name, entry in task.observation_entries.items():
         size = entry.value(s).shape[-1]
         who = "guided" if entry.guided else "both"
-        observation.append(
-            [f"{start}-{start + size - 1}", f"`{name}`", str(size), entry.unit, entry.doc, who]
-        )
+        observation.append([f"{start}-{start + size - 1}", f"`{name}`", str(size), entry.unit, entry.doc, who])
         start += size
-    stages = [
-        [f"`{x.name}`", str(x.hold), f"`{x.back_to}`" if x.back_to else "never"] for x in task.machine.stages
-    ]
+    stages = [[f"`{x.name}`", str(x.hold), f"`{x.back_to}`" if x.back_to else "never"] for x in task.machine.stages]
     terms = [
         [f"`{name}`", t.part, f"{t.weight:g}", t.doc, "guided" if t.guided else "both"]
         for name, t in task.TERMS.terms.items()

@@ -34,7 +34,7 @@ class Episode:
                 buffer[rows] = 0.0
         self.start_p[rows] = start_p
 
-    def record_contacts(self, contacts: Contacts, frequency: float) -> None:
+    def record_contacts(self, contacts: Contacts, frequency: int) -> None:
         """Takes over the contacts of the last physics step, which lasted 1 / `frequency` [Hz]."""
         force = contacts.impulse[:, :OBJECT, OBJECT].norm(dim=-1) * frequency
         depth = (-contacts.separation).clamp(min=0)

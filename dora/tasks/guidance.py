@@ -85,9 +85,7 @@ def _within(t: Tracking, tolerance: tuple[float, float]) -> Tensor:
 PHASES: list[Stage[Tracking]] = [
     Stage("approach", _none, lambda t: _within(t, ARRIVED)),
     Stage("descend", _none, lambda t: (t.standoff <= 0) & (_within(t, SETTLED) | (t.waited >= PATIENCE))),
-    Stage(
-        "close", _none, lambda t: t.closing >= 1, hold=4, lost=lambda t: t.offset > GONE, back_to="approach"
-    ),
+    Stage("close", _none, lambda t: t.closing >= 1, hold=4, lost=lambda t: t.offset > GONE, back_to="approach"),
     Stage("lift", _none, lambda t: t.offset < 0, lost=lambda t: t.offset > GONE, back_to="approach"),
 ]
 APPROACH, DESCEND, CLOSE, LIFT = range(4)
@@ -217,12 +215,8 @@ class GraspReference:
         )
         self.phase.advance(tracking)
         now = self.phase.index
-        b["standoff"].copy_(
-            torch.where(now == DESCEND, (b["standoff"] - DESCENT).clamp(min=0), b["standoff"])
-        )
-        b["closing"].copy_(
-            torch.where(now == CLOSE, (b["closing"] + 1 / CLOSING_STEPS).clamp(max=1), b["closing"])
-        )
+        b["standoff"].copy_(torch.where(now == DESCEND, (b["standoff"] - DESCENT).clamp(min=0), b["standoff"]))
+        b["closing"].copy_(torch.where(now == CLOSE, (b["closing"] + 1 / CLOSING_STEPS).clamp(max=1), b["closing"]))
         b["raised"].copy_(torch.where(now == LIFT, (b["raised"] + ASCENT).clamp(max=RISE), b["raised"]))
         b["waited"].copy_(torch.where((now == DESCEND) & (b["standoff"] <= 0), b["waited"] + 1, 0.0))
         entered = ((now == CLOSE) & (before != CLOSE))[:, None]

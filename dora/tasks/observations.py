@@ -79,9 +79,7 @@ OBSERVATIONS: dict[str, Entry] = {
         "wrist to candidate: position and rotation vector",
         True,
     ),
-    "goal_hand": Entry(
-        lambda s: s.goal_grasp - s.hand_q, "rad", "candidate's closed hand minus measured joints", True
-    ),
+    "goal_hand": Entry(lambda s: s.goal_grasp - s.hand_q, "rad", "candidate's closed hand minus measured joints", True),
     "phase": Entry(
         lambda s: F.one_hot(s.phase, len(PHASES) + 1)[:, : len(PHASES)].float(),
         "1",

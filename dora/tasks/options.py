@@ -9,12 +9,10 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from dora.errors import InputError
 from dora.robot import available_robots
 from dora.sim.rendering import can_render
-from dora.sim.robot import COUPLED, DescribedRobot, register_robot
+from dora.sim.robot import CONTROL_MODES, COUPLED, DescribedRobot, register_robot
 from dora.tasks.presets import Preset, find_preset
 
 GUIDANCE = ("affordance", "none")
-CONTROL_MODE = "wrist_delta_hand_pos"
-"""Default control mode."""
 
 
 def choose_render_backend(render_mode: str | None, obs_mode: str | None) -> str:
@@ -79,12 +77,13 @@ def check_options(
     if robot_uids not in REGISTERED_AGENTS:
         register_robot(robot_uids)
     if not issubclass(REGISTERED_AGENTS[robot_uids].agent_cls, DescribedRobot):
-        raise InputError(
-            f"robot {robot_uids!r} has no hand for this task; use one of {', '.join(available_robots())}"
-        )
-    mode = control_mode or CONTROL_MODE
+        raise InputError(f"robot {robot_uids!r} has no hand for this task; use one of {', '.join(available_robots())}")
+    mode = control_mode or CONTROL_MODES[0]
     if hand_joints == 15 and not mode.endswith(COUPLED):
         mode += COUPLED
+    known = [m + end for m in CONTROL_MODES for end in ("", COUPLED)]
+    if mode not in known:
+        raise InputError(f"unknown control mode {control_mode!r}; choose one of {', '.join(known)}")
     if sim_backend == "auto" and not torch.cuda.is_available():
         sim_backend = "physx_cpu_batch" if num_envs > 1 else "physx_cpu"
     if render_backend == "auto":

@@ -27,8 +27,7 @@ def add_table(scene: ManiSkillScene) -> Actor:
     builder.add_box_collision(top, list(TABLE_HALF))
     if scene.can_render():
         wood, steel, floor = (
-            sapien.render.RenderMaterial(base_color=list(c), roughness=0.7, specular=0.3)
-            for c in (WOOD, STEEL, FLOOR)
+            sapien.render.RenderMaterial(base_color=list(c), roughness=0.7, specular=0.3) for c in (WOOD, STEEL, FLOOR)
         )
         builder.add_box_visual(top, list(TABLE_HALF), wood)
         half = TABLE_HEIGHT / 2 - TABLE_HALF[2]
@@ -40,8 +39,6 @@ def add_table(scene: ManiSkillScene) -> Actor:
                     -2 * TABLE_HALF[2] - half,
                 ]
                 builder.add_box_visual(sapien.Pose(foot), [LEG_HALF, LEG_HALF, half], steel)
-        builder.add_box_visual(
-            sapien.Pose([x, y, -TABLE_HEIGHT - 0.01]), [FLOOR_HALF, FLOOR_HALF, 0.01], floor
-        )
+        builder.add_box_visual(sapien.Pose([x, y, -TABLE_HEIGHT - 0.01]), [FLOOR_HALF, FLOOR_HALF, 0.01], floor)
     builder.initial_pose = sapien.Pose()
     return builder.build_static("table")

@@ -43,18 +43,14 @@ class StageMachine(Generic[S]):
             if (s.lost is None) != (s.back_to is None):
                 raise ValueError(f"stage {s.name!r} must give both lost and back_to or neither")
             if s.back_to is not None and s.back_to not in names[:k]:
-                raise ValueError(
-                    f"stage {s.name!r} goes back to {s.back_to!r}, which is not an earlier stage"
-                )
+                raise ValueError(f"stage {s.name!r} goes back to {s.back_to!r}, which is not an earlier stage")
         self.stages = tuple(stages)
         self.index = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self.held = torch.zeros_like(self.index)
         self.furthest = torch.zeros_like(self.index)
         # Row K stands for "finished": never left, never held.
         self._hold = torch.tensor([s.hold for s in stages] + [1], device=device)
-        self._back = torch.tensor(
-            [names.index(s.back_to) if s.back_to else 0 for s in stages] + [0], device=device
-        )
+        self._back = torch.tensor([names.index(s.back_to) if s.back_to else 0 for s in stages] + [0], device=device)
 
     def __len__(self) -> int:
         return len(self.stages)

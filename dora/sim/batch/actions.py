@@ -48,9 +48,7 @@ def _check_robots(env: Any, action: Mapping[str, Any]) -> None:
 
 def _check_array(action: Any, space: Any, environments: int, whose: str) -> None:
     if isinstance(space, spaces.Dict):
-        raise InputError(
-            f"There are several robots: pass a dictionary of actions for {sorted(space.spaces)}."
-        )
+        raise InputError(f"There are several robots: pass a dictionary of actions for {sorted(space.spaces)}.")
     shape, single = tuple(np.shape(action)), tuple(space.shape)
     if shape != (environments, *single) and not (environments == 1 and shape == single):
         raise InputError(f"The action{whose} has shape {shape} but {(environments, *single)} is needed.")

@@ -110,9 +110,7 @@ def _locate_link_velocities(system: BatchSystem, elements: np.ndarray) -> Locate
     vectors, vector_of = np.unique(rows * 2 + kind, return_inverse=True)
     bodies = system.layout.bodies
     getters = [
-        bodies[vector // 2].body.get_angular_velocity
-        if vector % 2
-        else bodies[vector // 2].body.get_linear_velocity
+        bodies[vector // 2].body.get_angular_velocity if vector % 2 else bodies[vector // 2].body.get_linear_velocity
         for vector in vectors.tolist()
     ]
     return GetterSource(getters, system.stepper.epoch), vector_of.reshape(elements.shape) * _AXES + axis
@@ -120,11 +118,11 @@ def _locate_link_velocities(system: BatchSystem, elements: np.ndarray) -> Locate
 
 def _pose_setter(row: BodyRow) -> Setter:
     """A link's pose is set through the link, as ManiSkill does: for a root it moves the articulation."""
-    return partial(_set_pose, row.body if row.is_link else row.entity)
+    return partial(_set_pose, row.body.set_entity_pose if row.is_link else row.entity.set_pose)
 
 
-def _set_pose(target: Any, pose: np.ndarray) -> None:
-    target.set_pose(sapien.Pose(pose[:_AXES], pose[_AXES:]))
+def _set_pose(setter: Callable[[sapien.Pose], None], pose: Any) -> None:
+    setter(sapien.Pose(pose[:_AXES], pose[_AXES:]))
 
 
 def _velocity_setter(row: BodyRow, kind: str) -> Setter | None:
@@ -143,7 +141,7 @@ def _push_table(system: BatchSystem, push: Callable[[Any, np.ndarray], None]) ->
 
 
 def _push(body: Any, force: np.ndarray) -> None:
-    body.add_force_at_point(force, (body.pose * body.cmass_local_pose).p)
+    body.add_force_at_point(force, (body.entity_pose * body.cmass_local_pose).p)
 
 
 def _twist(body: Any, torque: np.ndarray) -> None:
@@ -153,14 +151,10 @@ def _twist(body: Any, torque: np.ndarray) -> None:
 # ---- articulations -------------------------------------------------------------------------------
 
 
-def _joint_writer(
-    system: BatchSystem, setter: Callable, read: Callable[[np.ndarray], np.ndarray]
-) -> BlockWriter:
+def _joint_writer(system: BatchSystem, setter: Callable, read: Callable[[np.ndarray], np.ndarray]) -> BlockWriter:
     layout = system.layout
     setters = [partial(_set_joints, setter, row.articulation, row.dof) for row in layout.articulations]
-    return BlockWriter(
-        layout.max_dof, ((slice(0, layout.max_dof), setters),), read, system.writing_articulations
-    )
+    return BlockWriter(layout.max_dof, ((slice(0, layout.max_dof), setters),), read, system.writing_articulations)
 
 
 def _set_joints(setter: Callable, articulation: Articulation, dof: int, values: np.ndarray) -> None:

@@ -92,7 +92,7 @@ def _parse_backends(original: Callable) -> Callable:
 
 
 def _init(original: Callable) -> Callable:
-    def init(self: BaseEnv, num_envs: int = 1, *args: Any, **kwargs: Any) -> None:
+    def init(self: BaseEnv, num_envs: Any = 1, *args: Any, **kwargs: Any) -> None:
         if kwargs.get("sim_backend") == BACKEND:
             if not isinstance(num_envs, int | np.integer) or num_envs < 1:
                 raise InputError(f"num_envs is {num_envs!r}: it must be a whole number of at least 1.")
@@ -117,9 +117,7 @@ def _setup_scene(original: Callable) -> Callable:
             logger.warning(f"render_mode {self.render_mode!r} has no effect because there is no renderer.")
         self._set_scene_config()
         scenes = [
-            sapien.Scene(
-                [physx.PhysxCpuSystem(), *(sapien.render.RenderSystem(device) for device in renderers)]
-            )
+            sapien.Scene([physx.PhysxCpuSystem(), *(sapien.render.RenderSystem(device) for device in renderers)])
             for _ in range(self.num_envs)
         ]
         self.scene = BatchScene(scenes, sim_config=self.sim_config, device=self.device, backend=self.backend)
@@ -135,7 +133,7 @@ def _step_action(original: Callable) -> Callable:
         check_action(self, action)
         hooks = ("_before_simulation_step", "_after_simulation_step")
         watched = any(_is_overridden(self, hook) for hook in hooks)
-        system = self.scene.px
+        system: Any = self.scene.px
         system.defer(0 if watched else self._sim_steps_per_control)
         try:
             return original(self, action)

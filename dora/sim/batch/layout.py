@@ -47,9 +47,7 @@ class Layout:
         self.articulations: list[ArticulationRow] = []
         for actor in actors.values():
             if actor.px_body_type != "static":
-                for env, entity, body in zip(
-                    actor._scene_idxs.tolist(), actor._objs, actor._bodies, strict=True
-                ):
+                for env, entity, body in zip(actor._scene_idxs.tolist(), actor._objs, actor._bodies, strict=True):
                     self.bodies.append(BodyRow(env, entity, body, is_link=False))
         self.actor_rows = len(self.bodies)
         for articulation in articulations.values():
@@ -72,10 +70,7 @@ def pose_index(layout: Layout, scenes: list[sapien.Scene], poses: PackedSource) 
     """Index into ``poses.flat()`` of each body's position and quaternion, shape (bodies, 7)."""
     position = [{id(entity): i for i, entity in enumerate(scene.entities)} for scene in scenes]
     starts = poses.starts()
-    first = [
-        starts[row.environment] + POSE_FLOATS * position[row.environment][id(row.entity)]
-        for row in layout.bodies
-    ]
+    first = [starts[row.environment] + POSE_FLOATS * position[row.environment][id(row.entity)] for row in layout.bodies]
     return np.array(first, np.int64).reshape(-1, 1) + POSE_ORDER
 
 
@@ -141,8 +136,8 @@ def check_packing(layout: Layout, poses: np.ndarray, state: np.ndarray, index: S
     for i, row in enumerate(layout.articulations):
         _require(np.array_equal(state[index.qpos[i, : row.dof]], row.articulation.qpos), "joint positions")
         _require(np.array_equal(state[index.qvel[i, : row.dof]], row.articulation.qvel), "joint velocities")
-        targets = [float(np.ravel(joint.drive_target)[0]) for joint in row.joints]
-        _require(np.array_equal(state[index.target_qpos[i, : row.dof]], np.float32(targets)), "drive targets")
+        targets = [np.ravel(joint.drive_target)[0] for joint in row.joints]
+        _require(np.array_equal(state[index.target_qpos[i, : row.dof]], targets), "drive targets")
 
 
 def _require(equal: bool, what: str) -> None:

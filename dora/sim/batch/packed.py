@@ -6,7 +6,7 @@ returns exact copies of the simulator's numbers and changes nothing in it.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -21,6 +21,7 @@ _FLOAT_BYTES = 4
 _ZERO = bytes(_FLOAT_BYTES)
 
 
+@runtime_checkable
 class Source(Protocol):
     """Anything that has up-to-date simulator values as one flat array."""
 

@@ -142,7 +142,7 @@ class ContactImpulses(ContactScanner):
         key = (id(first), id(second))
         if key not in self._pairs:
             slot = self._new_slot(first, second)
-            self._pairs[key], self._pairs[key[::-1]] = (slot, 1.0), (slot, -1.0)
+            self._pairs[key], self._pairs[id(second), id(first)] = (slot, 1.0), (slot, -1.0)
         return self._pairs[key]
 
     def _body_slot(self, body: Any) -> int:

@@ -1,13 +1,12 @@
 """A ManiSkill scene of N environments on the CPU, and pictures of them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import sapien
 import torch
 from mani_skill.envs.scene import ManiSkillScene
-from mani_skill.sensors.base_sensor import BaseSensor
 from mani_skill.utils.structs.render_camera import RenderCamera
 
 from dora.sim.batch.system import BatchSystem
@@ -94,8 +93,7 @@ class BatchScene(ManiSkillScene):
         if update_human_render_cameras:
             self._group_cameras(self.human_render_cameras, self.rendered_environments)
 
-    def _group_cameras(self, cameras: dict[str, BaseSensor], environments: Sequence[int]) -> None:
-        for name, sensor in cameras.items():
-            chosen = [sensor.camera._render_cameras[i] for i in environments]  # type: ignore[attr-defined]
-            sensor.camera.camera_group = self.camera_groups[name] = CameraGroup(chosen)  # type:
-            ignore[attr - defined]
+    def _group_cameras(self, sensors: Mapping[str, Any], environments: Sequence[int]) -> None:
+        for sensor in sensors.values():
+            cameras = sensor.camera._render_cameras
+            sensor.camera.camera_group = CameraGroup([cameras[i] for i in environments])

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import sapien
-from sapien import physx
 
 from dora.sim.batch.packed import PackedSource
 from dora.sim.batch.queries import ContactImpulses, ContactScanner
@@ -24,9 +24,7 @@ class TargetQueue:
     def __len__(self) -> int:
         return len(self._batches)
 
-    def add(
-        self, setters: Setters, numbers: np.ndarray, values: np.ndarray, environments: np.ndarray
-    ) -> None:
+    def add(self, setters: Setters, numbers: np.ndarray, values: np.ndarray, environments: np.ndarray) -> None:
         """Let ``setters[numbers[k]](values[k])`` wait for environment ``environments[k]``."""
         order = np.argsort(environments, kind="stable")
         edges = np.searchsorted(environments[order], self._edges)
@@ -54,7 +52,7 @@ class Stepper:
     """
 
     def __init__(self, scenes: Sequence[sapien.Scene]):
-        systems: list[physx.PhysxCpuSystem] = [scene.physx_system for scene in scenes]
+        systems: list[Any] = [scene.physx_system for scene in scenes]
         self.poses = PackedSource([scene.pack_poses for scene in scenes])
         self.state = PackedSource([system.pack for system in systems])
         self.contacts = ContactImpulses([system.get_contacts for system in systems])
@@ -167,9 +165,7 @@ class Stepper:
         self.poses.invalidate(environments)
         self.state.invalidate(environments)
 
-    def set_targets(
-        self, setters: Setters, numbers: np.ndarray, values: np.ndarray, environments: np.ndarray
-    ) -> None:
+    def set_targets(self, setters: Setters, numbers: np.ndarray, values: np.ndarray, environments: np.ndarray) -> None:
         """Call ``setters[numbers[k]](values[k])`` for environment ``environments[k]``, now or before its
         next step."""
         self._targets.add(setters, numbers, values, environments)

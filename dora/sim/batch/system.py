@@ -40,7 +40,7 @@ class BatchSystem:
 
     def __init__(self, scenes: Sequence[sapien.Scene]):
         self._scenes = list(scenes)
-        self._systems: list[physx.PhysxCpuSystem] = [scene.physx_system for scene in scenes]
+        self._systems: list[Any] = [scene.physx_system for scene in scenes]
         self.stepper = Stepper(scenes)
         self.stepper.resized = self._find_values
         self.layout = Layout({}, {})

@@ -115,9 +115,7 @@ class Table:
         return getattr(self[...], name)
 
     @classmethod
-    def __torch_function__(
-        cls, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None
-    ) -> Any:
+    def __torch_function__(cls, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         """Let torch functions take a table where they take a tensor: they get a copy of it."""
         if function.__name__.endswith("_") and not function.__name__.endswith("__"):
             raise TypeError(f"write with table[...] = value: {function.__name__}() would change a copy")

@@ -1,0 +1,70 @@
+"""The run command refuses bad input with one sentence and exit status 2."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+SCRIPT = Path(__file__).parent.parent / "experiments" / "run.py"
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("run_script", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["run_script"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("", "--env"),
+        ("--env DoraCube-v1 --num-envs 0", "--num-envs is 0"),
+        ("--env DoraCube-v1 --total-steps -5", "--total-steps is -5"),
+        ("--env DoraCube-v1 --workers -1", "--workers is -1"),
+        ("--env DoraCube-v1 --noise-correlation 1", "--noise-correlation is 1.0"),
+        ("--env DoraCube-v1 --agent mappo", "two arms"),
+        ("--resume /nowhere", "not a run folder"),
+        ("--eval-only", "--checkpoint"),
+        ("--eval-only --checkpoint /nowhere.safetensors", "no checkpoint"),
+    ],
+)
+def test_bad_input(
+    script: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: str,
+    words: str,
+):
+    monkeypatch.setattr(sys, "argv", ["run.py", *arguments.split()])
+    assert script.main() == 2
+    captured = capsys.readouterr()
+    assert words in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+@pytest.mark.parametrize("arguments", ["--agent foo", "--no-such-option 1"])
+def test_errors_of_the_parser(script: ModuleType, monkeypatch: pytest.MonkeyPatch, arguments: str):
+    monkeypatch.setattr(sys, "argv", ["run.py", *arguments.split()])
+    with pytest.raises(SystemExit) as exit_info:
+        script.main()
+    assert exit_info.value.code == 2
+
+
+def test_resume_refuses_another_task(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    from dora.agents.presets import recommended
+    from dora.agents.runfolder import RunFolder
+
+    RunFolder(tmp_path).create(recommended("DoraCube-v1", "ppo"))
+    monkeypatch.setattr(sys, "argv", ["run.py", "--resume", str(tmp_path), "--env", "DoraJug-v1"])
+    assert script.main() == 2
+    assert "has env DoraCube-v1, not DoraJug-v1" in capsys.readouterr().err
