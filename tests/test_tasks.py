@@ -106,15 +106,19 @@ def test_evaluate_changes_nothing(batch: DoraEnv):
 
 def test_state_round_trip_restores_stage_observation_and_future(batch: DoraEnv):
     batch.reset(seed=0)
-    for _ in range(25):
+    for _ in range(9):
         batch.step(batch.scripted_action())
     state, info = batch.get_state_dict(), batch.get_info()
-    seen, follow = batch.get_obs(info), batch.step(batch.scripted_action())[0]
+    seen = batch.get_obs(info)
+    batch.step(batch.scripted_action())
+    after = batch.snapshot
     batch.reset(seed=9)
     batch.set_state_dict(state)
     assert torch.equal(batch.machine.index, state["machine"]["stage"])
     torch.testing.assert_close(batch.get_obs(batch.get_info()), seen, atol=1e-4, rtol=0)
-    torch.testing.assert_close(batch.step(batch.scripted_action())[0], follow, atol=0.2, rtol=0)
+    batch.step(batch.scripted_action())
+    torch.testing.assert_close(batch.snapshot.object_p, after.object_p, atol=1e-4, rtol=0)
+    torch.testing.assert_close(batch.snapshot.hand_q, after.hand_q, atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("which", [[2], [0, 1, 3, 4, 5]])
@@ -138,7 +142,7 @@ def test_partial_reset_leaves_the_others_bit_identical(batch: DoraEnv, which: li
 def test_a_batch_equals_singles(env_id: str):
     seeds = [11, 12, 13]
     task = tasks.make_task(env_id, len(seeds))
-    steps = actions(task, 12, scale=0.2)  # contacts amplify the last bit in which torch's batches differ
+    steps = actions(task, 8, scale=0.2)  # contacts amplify the last bit in which torch's batches differ
     together = roll(task, steps, seed=seeds)
     task.close()
     for i, seed in enumerate(seeds):

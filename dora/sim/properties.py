@@ -4,10 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 from mani_skill.utils.structs import Actor
+from sapien.physx import get_default_material
 
 
 class ObjectProperties:
     """Writes masses (with inertia in proportion) and friction of one body per environment.
+
+    Every shape needs a material of its own; ValueError otherwise.
 
     Attributes:
         nominal: masses as built [kg], one per environment.
@@ -18,6 +21,9 @@ class ObjectProperties:
         self.nominal = [float(b.mass) for b in self.bodies]
         self._inertia = [np.array(b.inertia) for b in self.bodies]
         self._materials = [[s.physical_material for s in b.get_collision_shapes()] for b in self.bodies]
+        owned = [m for materials in self._materials for m in materials]
+        if len(set(map(id, owned))) < len(owned) or get_default_material() in owned:
+            raise ValueError(f"the shapes of {actor.name} share a material: friction would change everywhere")
 
     def apply(self, rows: Sequence[int], mass: Sequence[float], friction: Sequence[float]) -> None:
         """Sets the bodies of the environments `rows`; `mass` [kg] and `friction` have one value per row."""

@@ -7,6 +7,7 @@ import sapien
 import torch
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Actor, Pose
+from sapien.physx import PhysxMaterial
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
@@ -21,6 +22,8 @@ HALF = 0.03
 """Nominal half edge of the cube [m]."""
 MASS = 0.12
 """Nominal mass of the cube [kg]."""
+FRICTION = 0.9
+"""Nominal friction of the cube; every episode sets its own."""
 CENTRE = (0.55, 0.0)
 """Middle of the area where the cube starts [m]."""
 SPREAD = 0.08
@@ -226,7 +229,9 @@ class CubeEnv(DoraEnv):
         cubes = []
         for i, half in enumerate(halves.tolist()):
             builder = self.scene.create_actor_builder()
-            builder.add_box_collision(half_size=[half] * 3, density=MASS / (2 * half) ** 3)
+            # A material of its own: without one, every shape of every environment shares SAPIEN's default.
+            material = PhysxMaterial(FRICTION, FRICTION, 0.0)
+            builder.add_box_collision(half_size=[half] * 3, material=material, density=MASS / (2 * half) ** 3)
             if self.scene.can_render():
                 paint = sapien.render.RenderMaterial(base_color=[0.85, 0.25, 0.15, 1.0], roughness=0.5)
                 builder.add_box_visual(half_size=[half] * 3, material=paint)
