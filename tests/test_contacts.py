@@ -75,3 +75,18 @@ def test_pairwise_and_net_impulses_equal_stock():
     for one, other in zip(*results, strict=True):
         assert one.abs().sum() > 0
         assert torch.equal(one, other)
+
+
+def test_only_the_pairs_asked_for_are_read():
+    env, _ = resting_cubes(dora.sim.BACKEND, 2)
+    actors = env.unwrapped.scene.actors
+    groups = {"a": [actors["cubeA"]], "b": [actors["cubeB"]], "table": [actors["table-workspace"]]}
+    monitor = ContactMonitor(env.unwrapped.scene, groups, [("table", "a")])
+    env.step(None)
+    contacts = monitor.read()
+    assert (contacts.impulse[:, 0, 2, 2] > 0).all()
+    assert (contacts.impulse[:, 1, 2] == 0).all()
+    assert torch.isinf(contacts.separation[:, 1, 2]).all()
+    with pytest.raises(InputError, match="unknown group"):
+        ContactMonitor(env.unwrapped.scene, groups, [("table", "c")])
+    env.close()

@@ -169,11 +169,10 @@ class DoraEnv(BaseEnv):
         self.observation_entries = {k: e for k, e in entries.items() if self.guided or not e.guided}
         self._poses = BodyReader(self.scene, [agent.wrist, *agent.tips, self.target_object])
         self._velocities = BodyReader(self.scene, [agent.wrist, self.target_object])
-        groups = dict(zip(FINGERS, agent.finger_links, strict=True))
-        self._contacts = ContactMonitor(
-            self.scene,
-            {**groups, "palm": [agent.palm], "object": [self.target_object], "world": [self.table]},
-        )
+        groups = dict(zip(FINGERS, agent.finger_links, strict=True)) | {"palm": [agent.palm]}
+        pairs = [(part, other) for part in groups for other in ("object", "world")] + [("object", "world")]
+        groups |= {"object": [self.target_object], "world": [self.table]}
+        self._contacts = ContactMonitor(self.scene, groups, pairs)
         self._properties = ObjectProperties(self.target_object)
         self._hand_index = torch.tensor(agent.hand_index, device=device)
         self._arm_index = torch.tensor(agent.arm_index, device=device)
