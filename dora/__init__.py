@@ -8,4 +8,5 @@ to all of them:
 """
 
 import mani_skill.envs as _stock_tasks  # noqa: F401
+
 from dora import tasks as tasks

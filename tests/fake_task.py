@@ -28,9 +28,7 @@ class PointMass:
         "action_norm",
     )
 
-    def __init__(
-        self, num_envs: int = 8, max_steps: int = 16, deterministic: bool = False, fail_at: int = -1
-    ):
+    def __init__(self, num_envs: int = 8, max_steps: int = 16, deterministic: bool = False, fail_at: int = -1):
         self.num_envs, self.max_steps, self.deterministic, self.fail_at = (
             num_envs,
             max_steps,
@@ -47,15 +45,11 @@ class PointMass:
         options = options or {}
         if seed is not None and "env_idx" in options:
             raise ValueError("a seed reseeds every environment and cannot come with env_idx")
-        seeds = (
-            seed if isinstance(seed, list) else [seed + row for row in range(self.num_envs)] if seed else None
-        )
+        seeds = seed if isinstance(seed, list) else [seed + row for row in range(self.num_envs)] if seed else None
         if seeds is not None:
             self.generators = [np.random.default_rng(s) for s in seeds]
         index = options.get("env_idx", torch.arange(self.num_envs))
-        draws = torch.tensor(
-            np.array([self.generators[i].uniform(-1, 1, 4) for i in index]), dtype=torch.float32
-        )
+        draws = torch.tensor(np.array([self.generators[i].uniform(-1, 1, 4) for i in index]), dtype=torch.float32)
         draws = torch.full_like(draws, 0.5) if self.deterministic else draws
         self.position[index], self.goal[index] = draws[:, :2] * 0.2, draws[:, 2:]
         self.elapsed_steps[index] = 0

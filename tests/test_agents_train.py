@@ -92,9 +92,7 @@ def test_sac_learns(tmp_path: Path):
 def test_resuming_goes_on_exactly(tmp_path: Path, agent: str):
     """Episodes end with the rollout and all start alike, so a restart of the environments changes nothing."""
     learner = SMALL_PPO if agent == "ppo" else SACConfig(rollout=16, batch=64, warmup=100, hidden=(16, 16))
-    config = dataclasses.replace(
-        BASE, agent=agent, learner=learner, total_steps=4 * 256, eval_every=512, stagger=False
-    )
+    config = dataclasses.replace(BASE, agent=agent, learner=learner, total_steps=4 * 256, eval_every=512, stagger=False)
     make = functools.partial(PointMass, deterministic=True)
     run(tmp_path / "straight", config, make)
     run(tmp_path / "halves", dataclasses.replace(config, total_steps=2 * 256), make)
@@ -196,9 +194,7 @@ def wait_for_checkpoint(process: subprocess.Popen[bytes], path: Path, newer_than
 
 
 def session_is_empty(session: int) -> bool:
-    out = subprocess.run(
-        ["ps", "-s", str(session), "-o", "pid=,stat="], capture_output=True, text=True
-    ).stdout
+    out = subprocess.run(["ps", "-s", str(session), "-o", "pid=,stat="], capture_output=True, text=True).stdout
     return all("Z" in line.split()[1] for line in out.splitlines() if line.strip())
 
 
@@ -234,9 +230,7 @@ def test_every_tag_written_is_explained(tmp_path: Path):
     events = EventAccumulator(str(tmp_path / "run"))
     events.Reload()
     tags = events.Tags()["scalars"]
-    assert {"loss/policy", "episode/reward/distance", "evaluation/stage/reach", "speed/learn_share"} <= set(
-        tags
-    )
+    assert {"loss/policy", "episode/reward/distance", "evaluation/stage/reach", "speed/learn_share"} <= set(tags)
     families = ("episode/reward/", "episode/stage/", "evaluation/stage/", "episode/")
     unexplained = [t for t in tags if t not in TAGS and not t.startswith(families)]
     assert not unexplained

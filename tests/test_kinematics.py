@@ -89,12 +89,8 @@ def test_all_links_agree_between_three_libraries_and_ours(robot, chain, tmp_path
     for _ in range(CONFIGURATIONS):
         angles = dict(zip(names, rng.uniform(lower, upper), strict=True))
         order = other.get_joint_parameter_names()
-        poses = other.forward_kinematics(
-            torch.tensor([[angles[name] for name in order]], dtype=torch.float64)
-        )
-        pinocchio.framesForwardKinematics(
-            model, data, np.array([angles[str(name)] for name in list(model.names)[1:]])
-        )
+        poses = other.forward_kinematics(torch.tensor([[angles[name] for name in order]], dtype=torch.float64))
+        pinocchio.framesForwardKinematics(model, data, np.array([angles[str(name)] for name in list(model.names)[1:]]))
         articulation.set_qpos(np.array([angles[joint.name] for joint in articulation.active_joints]))
         for link in articulation.links:
             pose = poses[link.name].get_matrix()[0].numpy()
@@ -139,9 +135,7 @@ def test_damped_steps_reach_targets_near_home(robot, chain):
     target = chain.forward((start + noise).clamp(chain.lower, chain.upper)).tip
     q = start
     for _ in range(60):
-        q = q + chain.damped_step(
-            q, error_twist(target, chain.forward(q).tip), rest=start[:1], rest_gain=0.01
-        )
+        q = q + chain.damped_step(q, error_twist(target, chain.forward(q).tip), rest=start[:1], rest_gain=0.01)
     error = error_twist(target, chain.forward(q).tip).norm(dim=1)
     assert error.max() < 1e-3
     assert ((q >= chain.lower) & (q <= chain.upper)).all()
@@ -171,9 +165,7 @@ def test_velocity_limits_scale_the_whole_step(robot, chain):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_steps_and_gradients_are_finite_at_singular_and_unreachable_poses(robot, dtype):
     chain = SerialChain.of(robot, dtype=dtype)
-    q = torch.cat(
-        (torch.zeros(1, 7, dtype=dtype), chain.lower[None], chain.upper[None], random_arm(chain, 64))
-    )
+    q = torch.cat((torch.zeros(1, 7, dtype=dtype), chain.lower[None], chain.upper[None], random_arm(chain, 64)))
     q = q.detach().requires_grad_()
     for size in (0.0, 1e-3, 10.0):
         twist = size * torch.ones(len(q), 6, dtype=dtype)

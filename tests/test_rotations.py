@@ -53,9 +53,7 @@ def test_exponential_and_logarithm_agree_with_scipy(v):
 @given(rotation_vectors())
 @settings(max_examples=200, deadline=None)
 def test_small_angles_survive_single_precision(v):
-    back = rot.rotation_vector_from_quaternion(
-        rot.quaternion_from_rotation_vector(tensor(v * 1e-3).to(torch.float32))
-    )
+    back = rot.rotation_vector_from_quaternion(rot.quaternion_from_rotation_vector(tensor(v * 1e-3).to(torch.float32)))
     np.testing.assert_allclose(back, v * 1e-3, rtol=2e-6, atol=1e-12)
 
 

@@ -46,8 +46,5 @@ class GraspCandidates:
 
     def to(self, device: torch.device | str) -> "GraspCandidates":
         """The same candidates on another device."""
-        moved = {
-            k: getattr(self, k).to(device)
-            for k in ("position", "quaternion", "approach", "pregrasp", "grasp")
-        }
+        moved = {k: getattr(self, k).to(device) for k in ("position", "quaternion", "approach", "pregrasp", "grasp")}
         return GraspCandidates(object=self.object, grasp_class=self.grasp_class, **moved)

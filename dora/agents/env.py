@@ -132,9 +132,7 @@ class TaskEnv(EnvBase):
         )
         self.action_spec = Bounded(self._low.expand(n, -1), self._high.expand(n, -1), device=device)
         self.reward_spec = Unbounded(torch.Size([n, 1]), device=device)
-        self.done_spec = Composite(
-            done=flag(), terminated=flag(), truncated=flag(), shape=(n,), device=device
-        )
+        self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,), device=device)
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """What `EnvBase` does, for this environment's few keys: several times less Python per step."""
@@ -205,9 +203,7 @@ class TaskEnv(EnvBase):
             "length": one,
         }
         values = torch.stack([given[name].reshape(-1).float() for name in self.columns.names], 1)
-        last, highest, total = values.split(
-            [self._last.shape[1], self._highest.shape[1], self._total.shape[1]], dim=1
-        )
+        last, highest, total = values.split([self._last.shape[1], self._highest.shape[1], self._total.shape[1]], dim=1)
         self._last.copy_(last)
         torch.maximum(self._highest, highest, out=self._highest)
         self._total.add_(total)

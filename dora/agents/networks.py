@@ -154,9 +154,7 @@ class Policy(TensorDictModuleBase):
     (as in Hollenstein et al. 2024, Colored Noise in PPO) that ignores what the previous noise tells.
     """
 
-    def __init__(
-        self, normaliser: Normaliser, actor: GaussianActor | TanhActor, noise_correlation: float = 0.0
-    ):
+    def __init__(self, normaliser: Normaliser, actor: GaussianActor | TanhActor, noise_correlation: float = 0.0):
         super().__init__()
         self.in_keys, self.out_keys = ["observation"], ["action", "action_log_prob"]
         self.normaliser, self.actor, self.noise_correlation = normaliser, actor, noise_correlation

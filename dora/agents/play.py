@@ -73,9 +73,7 @@ def record(make_task: Callable[[], Task], act: Act, path: Path, episodes: int) -
     """
     task: Any = make_task()
     try:
-        low, high = (
-            torch.as_tensor(x) for x in (task.single_action_space.low, task.single_action_space.high)
-        )
+        low, high = (torch.as_tensor(x) for x in (task.single_action_space.low, task.single_action_space.high))
         path.parent.mkdir(parents=True, exist_ok=True)
         with torch.no_grad():
             first = _frames(task, act, FINAL_SEED, low, high)

@@ -8,8 +8,8 @@ from dora.agents.config import GUIDANCES, LEARNER_CONFIGS, SINGLE_ARM_AGENTS, Ru
 from dora.errors import InputError
 
 PRESETS: dict[tuple[str, str], dict[str, Any]] = {
-    ("DoraCube-v1", "ppo"): {"total_steps": 300_000, "num_envs": 32, "eval_every": 50_000},
-    ("DoraCube-v1", "sac"): {"total_steps": 200_000, "num_envs": 32, "eval_every": 40_000},
+    ("DoraCube-v1", "ppo"): {"total_steps": 200_000, "num_envs": 32, "eval_every": 50_000},
+    ("DoraCube-v1", "sac"): {"total_steps": 150_000, "num_envs": 32, "eval_every": 50_000},
 }
 """Differences from the defaults of `RunConfig`, and under `learner` from those of the learner."""
 
@@ -28,9 +28,7 @@ def recommended(env: str, agent: str, **overrides: Any) -> RunConfig:
         InputError: if a value makes no sense.
     """
     if agent not in SINGLE_ARM_AGENTS:
-        raise InputError(
-            f"The learner {agent} needs a task with two arms and {env} has one: use --agent ppo or sac."
-        )
+        raise InputError(f"The learner {agent} needs a task with two arms and {env} has one: use --agent ppo or sac.")
     preset = dict(PRESETS.get((env, agent), {}))
     learner = preset.pop("learner", {}) | {
         k: v for k, v in (overrides.pop("learner", None) or {}).items() if v is not None
@@ -50,9 +48,7 @@ def check(config: RunConfig) -> None:
     """
     for name in POSITIVE:
         if getattr(config, name) < 1:
-            raise InputError(
-                f"--{name.replace('_', '-')} is {getattr(config, name)} and has to be at least 1."
-            )
+            raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)} and has to be at least 1.")
     for name in ("workers", "seed"):
         if getattr(config, name) < 0:
             raise InputError(f"--{name} is {getattr(config, name)} and cannot be negative.")

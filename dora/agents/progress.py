@@ -36,9 +36,7 @@ class ProgressReport:
 
     def update(self, steps: int, rate: float, training: float | None, evaluated: float | None) -> None:
         """Show the number of steps so far, steps/s and the success rates in training and evaluation."""
-        status = (
-            f"{steps:,} steps  {rate:,.0f} steps/s  success {_rate(training)} (evaluated {_rate(evaluated)})"
-        )
+        status = f"{steps:,} steps  {rate:,.0f} steps/s  success {_rate(training)} (evaluated {_rate(evaluated)})"
         self._bar.update(self._task, completed=steps, status=status)
         now = time.monotonic()
         if not self.console.is_terminal and now >= self._next_line:

@@ -67,9 +67,7 @@ class RunFolder:
             InputError: if it cannot be written or holds a run already.
         """
         if (self.path / "config.yaml").exists():
-            raise InputError(
-                f"{self.path} holds a run already: continue it with --resume or choose another --out."
-            )
+            raise InputError(f"{self.path} holds a run already: continue it with --resume or choose another --out.")
         try:
             self.checkpoints.mkdir(parents=True, exist_ok=True)
         except OSError as error:

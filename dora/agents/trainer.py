@@ -225,9 +225,7 @@ class Trainer:
             return None
         return float(self.columns.column(self._recent, "success").mean())
 
-    def _log_iteration(
-        self, log: RunLog, values: dict[str, float], ended: Float[Tensor, "e k"], rate: float
-    ) -> None:
+    def _log_iteration(self, log: RunLog, values: dict[str, float], ended: Float[Tensor, "e k"], rate: float) -> None:
         counters = self.counters
         step = counters.env_steps
         log.add_learner(values, step)

@@ -117,6 +117,7 @@ class SerialChain:
         duration: float | None = None,
         rest: Float[Tensor, "#n dof"] | None = None,
         rest_gain: float = 0.1,
+        frames: Frames | None = None,
     ) -> Float[Tensor, "n dof"]:
         """Change of joint angles (rad) that moves the tip by a small displacement.
 
@@ -131,11 +132,12 @@ class SerialChain:
                 until no joint exceeds its velocity limit.
             rest: joint angles (rad) to prefer; none by default.
             rest_gain: share of the way to `rest` per step.
+            frames: `forward(q)`, if it is known already.
 
         Returns:
             dq, clamped so that q + dq stays within the joint limits.
         """
-        jacobian = self.jacobian(q)
+        jacobian = self.jacobian_of(self.forward(q) if frames is None else frames)
         goal = twist.unsqueeze(-1)
         pull = None if rest is None else (rest_gain * (rest - q)).unsqueeze(-1)
         if pull is not None:

@@ -27,7 +27,7 @@ T = TypeVar("T")
 KEYS = {
     "robot.toml": (
         ("name", "urdf", "wrist_link", "palm_link", "arm", "hand", "fingers", "postures", "contact"),
-        ("coupling", "never_touch"),
+        ("coupling", "no_collision"),
     ),
     "joint group": (("joints", "stiffness", "damping", "armature"), ()),
     "coupling": (("follower", "leader", "multiplier", "offset"), ()),
@@ -107,7 +107,7 @@ class _Reader:
             postures={name: self.posture(name, row, arm, hand) for name, row in content["postures"].items()},
             shapes=shapes,
             contacts=self.contacts(content["contact"], shapes),
-            ignored_pairs=self.pairs(content.get("never_touch", {}), shapes),
+            ignored_pairs=self.pairs(content.get("no_collision", {}), shapes),
         )
 
     def keys(self, table: Any, kind: str, where: str) -> None:
@@ -116,9 +116,7 @@ class _Reader:
         required, optional = KEYS[kind]
         for key in table:
             if key not in required + optional:
-                raise self.fail(
-                    f"{where} has the unknown key {key!r}; known: {', '.join(required + optional)}."
-                )
+                raise self.fail(f"{where} has the unknown key {key!r}; known: {', '.join(required + optional)}.")
         for key in required:
             if key not in table:
                 raise self.fail(f"{where} lacks the key {key!r}; add it.")
@@ -160,8 +158,7 @@ class _Reader:
             for key in ("lower", "upper", "velocity", "effort")
         }
         gains = {
-            key: self.numbers(table[key], len(names), f"{name}.{key}")
-            for key in ("stiffness", "damping", "armature")
+            key: self.numbers(table[key], len(names), f"{name}.{key}") for key in ("stiffness", "damping", "armature")
         }
         for key in ("velocity", "effort"):
             if (limits[key] <= 0).any():
@@ -187,9 +184,7 @@ class _Reader:
         for key in ("follower", "leader"):
             if table[key] not in hand.names:
                 raise self.fail(f"the {key} {table[key]!r} of a coupling is not a joint of the hand.")
-        factors = self.numbers(
-            [table["multiplier"], table["offset"]], 2, "a coupling's multiplier and offset"
-        )
+        factors = self.numbers([table["multiplier"], table["offset"]], 2, "a coupling's multiplier and offset")
         follower, leader = (hand.names.index(table[key]) for key in ("follower", "leader"))
         return Coupling(follower, leader, *factors.tolist())
 
@@ -231,17 +226,17 @@ class _Reader:
         return found
 
     def pairs(self, table: Table, shapes: Iterable[str]) -> frozenset[tuple[str, str]]:
-        """Link pairs of `never_touch`; links joined by one joint, or by fixed joints, are added."""
+        """Link pairs of `no_collision`; links joined by one joint, or by fixed joints, are added."""
         pairs = set()
         for link, others in table.items():
-            for other in self.names(others, f"never_touch.{link}"):
+            for other in self.names(others, f"no_collision.{link}"):
                 if link == other:
-                    raise self.fail(f"never_touch.{link} names the link itself; remove it.")
+                    raise self.fail(f"no_collision.{link} names the link itself; remove it.")
                 pairs.add((min(self.link(link), self.link(other)), max(link, other)))
         adjacent = {frozenset((joint.parent, joint.child)) for joint in self.model.joints.values()}
         known = sorted(shapes)
         pairs |= {(a, b) for a, b in combinations(known, 2) if frozenset((a, b)) in adjacent}
         stray = sorted(link for pair in pairs for link in pair if link not in known)
         if stray:
-            raise self.fail(f"never_touch names {stray[0]!r}, which has no collision shapes; remove it.")
+            raise self.fail(f"no_collision names {stray[0]!r}, which has no collision shapes; remove it.")
         return frozenset(pairs)

@@ -17,9 +17,7 @@ SMALL_ANGLE = 1e-4
 """Below this angle (rad) series replace quotients; their relative error is below 1e-16."""
 
 
-def quaternion_multiply(
-    a: Float[Tensor, "*#batch 4"], b: Float[Tensor, "*#batch 4"]
-) -> Float[Tensor, "*out 4"]:
+def quaternion_multiply(a: Float[Tensor, "*#batch 4"], b: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*out 4"]:
     """Hamilton product a b: the rotation b followed by a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)

@@ -6,6 +6,7 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Literal
 
@@ -59,6 +60,13 @@ class UrdfModel:
             found.append(above[tip])
             tip = above[tip].parent
         return tuple(reversed(found))
+
+    def frame(self, link: str, tip: str) -> np.ndarray:
+        """Pose (4, 4) of `tip` in `link`, which must carry it by fixed joints; ValueError if not."""
+        joints = self.chain(tip)[len(self.chain(link)) :]
+        if any(joint.moves for joint in joints) or not joints or joints[0].parent != link:
+            raise ValueError(f"{tip} is not fixed to {link}")
+        return reduce(np.matmul, [joint.origin for joint in joints])
 
 
 def read_urdf(path: Path) -> UrdfModel:
@@ -134,9 +142,7 @@ def _shape(collision: ElementTree.Element) -> Shape:
     return Shape(kind, position, quaternion, size)
 
 
-_SIZES: dict[
-    str, Callable[[ElementTree.Element], tuple[Literal["box", "sphere", "cylinder"], tuple[float, ...]]]
-] = {
+_SIZES: dict[str, Callable[[ElementTree.Element], tuple[Literal["box", "sphere", "cylinder"], tuple[float, ...]]]] = {
     "box": lambda e: ("box", tuple(v / 2 for v in _floats(e, "size"))),
     "sphere": lambda e: ("sphere", (float(_text(e, "radius")),)),
     "cylinder": lambda e: ("cylinder", (float(_text(e, "radius")), float(_text(e, "length")) / 2)),

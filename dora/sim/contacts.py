@@ -52,9 +52,7 @@ class ContactMonitor:
         InputError: if a body is in two groups, or a pair names an unknown group.
     """
 
-    def __init__(
-        self, scene: Any, groups: Mapping[str, Sequence[Any]], pairs: Iterable[tuple[str, str]] | None = None
-    ):
+    def __init__(self, scene: Any, groups: Mapping[str, Sequence[Any]], pairs: Iterable[tuple[str, str]] | None = None):
         self.names = tuple(groups)
         wanted = _wanted(self.names, pairs)
         self._scene = scene

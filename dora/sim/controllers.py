@@ -14,7 +14,7 @@ from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController, PDJ
 from torch import Tensor
 
 from dora.robot.description import RobotDescription
-from dora.robot.kinematics import SerialChain
+from dora.robot.kinematics import Frames, SerialChain
 from dora.robot.rotations import quaternion_from_matrix
 
 WRIST_SPEED = 0.6
@@ -54,6 +54,7 @@ class WristHandController(BaseController):
         self.hand_step = torch.tensor(robot.hand.velocity, dtype=f32, device=self.device) * self.dt
         self.target: Tensor = torch.empty(0)
         self._begun = False
+        self._known: tuple[Tensor, Frames] | None = None
 
     def _initialize_action_space(self) -> None:
         size = 6 + self.hand_size
@@ -88,7 +89,7 @@ class WristHandController(BaseController):
         """
         if len(self.target) == 0:
             self.target = self.qpos.clone()
-        self.target[rows] = joints
+        self.target = self.target.index_copy(0, rows, joints)
         self._begun = True
 
     def reset(self) -> None:
@@ -103,8 +104,14 @@ class WristHandController(BaseController):
 
     def wrist(self) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
         """The commanded wrist pose in the robot's base frame."""
-        position, matrix = self.chain.tip_pose(self.target[:, : self.arm_size])
-        return position, quaternion_from_matrix(matrix)
+        tip = self._frames().tip
+        return tip[:, :3, 3], quaternion_from_matrix(tip[:, :3, :3])
+
+    def _frames(self) -> Frames:
+        """Forward kinematics of the commanded arm, once per command."""
+        if self._known is None or self._known[0] is not self.target:
+            self._known = (self.target, self.chain.forward(self.target[:, : self.arm_size]))
+        return self._known[1]
 
     def hand_action(self, joints: Float[Tensor, "n 20"]) -> Float[Tensor, "n h"]:
         """Hand components of the action that ask for these joint targets [rad]."""
@@ -116,7 +123,9 @@ class WristHandController(BaseController):
         """Moves the commanded joints by one control step and sends them to the drives."""
         action = action.clamp(-1, 1)
         arm, hand = self.target[:, : self.arm_size], self.target[:, self.arm_size :]
-        arm = arm + self.chain.damped_step(arm, action[:, :6] * self.wrist_scale, duration=self.dt)
+        arm = arm + self.chain.damped_step(
+            arm, action[:, :6] * self.wrist_scale, duration=self.dt, frames=self._frames()
+        )
         measured = self.qpos[:, : self.arm_size]
         arm = torch.clamp(arm, measured - ARM_LEASH, measured + ARM_LEASH)
         arm = torch.clamp(arm, self.arm_lower, self.arm_upper)
@@ -138,7 +147,7 @@ class WristHandController(BaseController):
         """Restores commanded joints [rad] and drive targets of the environments `rows`."""
         if len(self.target) == 0:
             self.target = self.qpos.clone()
-        self.target[rows] = target
+        self.target = self.target.index_copy(0, rows, target)
         self.articulation.set_joint_drive_targets(self.target, self.joints, self.active_joint_indices)
         if self.scene.gpu_sim_enabled:
             self.scene.px.gpu_apply_articulation_target_position()

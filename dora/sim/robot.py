@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import numpy as np
 import sapien
 import torch
+from jaxtyping import Float
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosControllerConfig
 from mani_skill.agents.registration import REGISTERED_AGENTS, register_agent
@@ -15,7 +16,7 @@ from torch import Tensor
 from dora.errors import InputError
 from dora.robot import RobotDescription, available_robots, load_robot
 from dora.robot.kinematics import SerialChain
-from dora.robot.rotations import quaternion_from_matrix
+from dora.robot.rotations import quaternion_apply, quaternion_from_matrix, quaternion_multiply
 from dora.sim.controllers import CoupledJointPosConfig, WristHandConfig
 
 CONTROL_MODES = ("wrist_delta_hand_pos", "pd_joint_pos", "pd_joint_delta_pos")
@@ -38,6 +39,11 @@ class DescribedRobot(BaseAgent):
         loader.name = self.uid if self._agent_idx is None else f"{self.uid}-agent-{self._agent_idx}"
         loader.fix_root_link = self.fix_root_link
         builder = loader.parse(str(self.description.urdf))["articulation_builders"][0]
+        # The tips are frames, not bodies: as links they would cost PhysX 6 % of a step.
+        frames = {f.tip for f in self.description.fingers.values()}
+        builder.link_builders = [link for link in builder.link_builders if link.name not in frames]
+        for index, link in enumerate(builder.link_builders):
+            link.index = index
         bits = self.description.collision_bits()
         for link in builder.link_builders:
             link.collision_records = []
@@ -72,13 +78,27 @@ class DescribedRobot(BaseAgent):
         d, links = self.description, self.robot.links_map
         self.wrist: Link = links[d.wrist_link]
         self.palm: Link = links[d.palm_link]
-        self.tips: list[Link] = [links[f.tip] for f in d.fingers.values()]
+        self.distals: list[Link] = [links[f.distal] for f in d.fingers.values()]
+        self._tip_p, self._tip_q = (x.to(self.device) for x in self._tip_frames())
         self.finger_links: list[list[Link]] = [[links[n] for n in f.links] for f in d.fingers.values()]
         self.hand_index = [self.robot.active_joints_map[n].active_index[0].item() for n in d.hand.names]
         self.arm_index = [self.robot.active_joints_map[n].active_index[0].item() for n in d.arm.names]
         self.keyframes = {
             name: Keyframe(pose=sapien.Pose(), qpos=self.qpos_of(p.arm, p.hand)) for name, p in d.postures.items()
         }
+
+    def _tip_frames(self) -> tuple[Tensor, Tensor]:
+        """Fingertip frames in their distal links: (f, 3) [m], (f, 4) wxyz."""
+        model, fingers = self.description.model, self.description.fingers.values()
+        frames = torch.tensor(np.stack([model.frame(f.distal, f.tip) for f in fingers]), dtype=torch.float32)
+        return frames[:, :3, 3], quaternion_from_matrix(frames[:, :3, :3])
+
+    def tips_of(
+        self, distal_p: Float[Tensor, "n f 3"], distal_q: Float[Tensor, "n f 4"]
+    ) -> tuple[Float[Tensor, "n f 3"], Float[Tensor, "n f 4"]]:
+        """Poses of the fingertip frames from those of the distal links."""
+        shift = quaternion_apply(distal_q, self._tip_p.expand_as(distal_p))
+        return distal_p + shift, quaternion_multiply(distal_q, self._tip_q.expand_as(distal_q))
 
     def qpos_of(self, arm: np.ndarray, hand: np.ndarray) -> np.ndarray:
         """Joint vectors (..., n_arm), (..., n_hand) -> the simulator's order (..., n_arm + n_hand) [rad]."""

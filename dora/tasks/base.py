@@ -2,7 +2,6 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -29,7 +28,7 @@ from dora.tasks.observations import OBSERVATIONS, Entry
 from dora.tasks.options import check_options
 from dora.tasks.rewards import Terms
 from dora.tasks.scene import add_table
-from dora.tasks.snapshot import FINGERS, Snapshot
+from dora.tasks.snapshot import FINGERS, Snapshot, advanced
 from dora.tasks.stages import Stage, StageMachine
 
 CANDIDATE_DRAWS = 26
@@ -73,7 +72,7 @@ class DoraEnv(BaseEnv):
     """Penetration that spoils an episode [m]."""
     CONTROL_FREQUENCY: ClassVar[int] = 20
     """Control steps per second [Hz]."""
-    PHYSICS_FREQUENCY: ClassVar[int] = 120
+    PHYSICS_FREQUENCY: ClassVar[int] = 100
     """Physics steps per second [Hz]."""
     SOLVER_ITERATIONS: ClassVar[int] = 6
     """PhysX position iterations."""
@@ -90,7 +89,7 @@ class DoraEnv(BaseEnv):
 
     @abstractmethod
     def load_object(self, scale: np.ndarray) -> Actor:
-        """Builds the object into every sub-scene, `scale` (n,) times its nominal size; sets `object_half` (n, 3) [m]."""
+        """Builds the object into every sub-scene, `scale` (n,) times its size; sets `object_half` (n, 3) [m]."""
 
     @abstractmethod
     def place(self, env_idx: Tensor, u: Tensor) -> None:
@@ -167,7 +166,7 @@ class DoraEnv(BaseEnv):
             self._terms = self._terms.without_guidance()
         entries = {**OBSERVATIONS, **self.EXTRA_OBSERVATIONS}
         self.observation_entries = {k: e for k, e in entries.items() if self.guided or not e.guided}
-        self._poses = BodyReader(self.scene, [agent.wrist, *agent.tips, self.target_object])
+        self._poses = BodyReader(self.scene, [agent.wrist, *agent.distals, self.target_object])
         self._velocities = BodyReader(self.scene, [agent.wrist, self.target_object])
         groups = dict(zip(FINGERS, agent.finger_links, strict=True)) | {"palm": [agent.palm]}
         pairs = [(part, other) for part in groups for other in ("object", "world")] + [("object", "world")]
@@ -219,6 +218,7 @@ class DoraEnv(BaseEnv):
         pose, velocity = self._poses.poses(), self._velocities.velocities()
         p, q, v, w = pose[..., :3], pose[..., 3:], velocity[..., :3], velocity[..., 3:]
         qpos, qvel = self.agent.robot.get_qpos(), self.agent.robot.get_qvel()
+        tip_p, tip_q = self.agent.tips_of(p[:, 1:6], q[:, 1:6])
         e, r, hand_q = self.episode, self.reference, qpos[:, self._hand_index]
         goal_p, goal_q = r.goal(p[:, 6], q[:, 6])
         controller = self.agent.controller
@@ -226,7 +226,7 @@ class DoraEnv(BaseEnv):
         return Snapshot(
             arm_q=qpos[:, self._arm_index], hand_q=hand_q, hand_v=qvel[:, self._hand_index],
             hand_target=controller.target[:, controller.arm_size :] if commanded else hand_q,
-            wrist_p=p[:, 0], wrist_q=q[:, 0], wrist_v=v[:, 0], wrist_w=w[:, 0], tip_p=p[:, 1:6], tip_q=q[:, 1:6],
+            wrist_p=p[:, 0], wrist_q=q[:, 0], wrist_v=v[:, 0], wrist_w=w[:, 0], tip_p=tip_p, tip_q=tip_q,
             object_p=p[:, 6], object_q=q[:, 6], object_v=v[:, 1], object_w=w[:, 1],
             object_half=self.object_half, start_p=e.start_p.clone(),
             touch=e.touch > 0, force=e.force.clone(), supported=e.supported > 0,
@@ -297,7 +297,7 @@ class DoraEnv(BaseEnv):
         s = self._read()
         self.machine.advance(s)
         self.reference.advance(s)
-        self._snapshot = replace(
+        self._snapshot = advanced(
             s,
             stage=self.machine.index.clone(),
             phase=self.reference.phase.index.clone(),

@@ -1,6 +1,7 @@
 """DoraCube-v1: grasp a cube on a table and lift it."""
 
 from math import cos, pi, sin
+from typing import ClassVar
 
 import numpy as np
 import sapien
@@ -15,7 +16,7 @@ from dora.robot.rotations import quaternion_apply, quaternion_multiply
 from dora.tasks.base import DoraEnv
 from dora.tasks.observations import Entry
 from dora.tasks.rewards import Term, Terms, closeness
-from dora.tasks.snapshot import Snapshot, goal_error, in_wrist, lifted, opposed, tips_in_object
+from dora.tasks.snapshot import Snapshot, derived, goal_error, in_wrist, lifted, opposed, tips_in_object
 from dora.tasks.stages import Stage
 
 HALF = 0.03
@@ -44,6 +45,7 @@ ALPHA = 4.0
 """Spatial sensitivity of the affordance reward [1/m]."""
 
 
+@derived
 def surface_distance(s: Snapshot) -> Tensor:
     """(n, 5) distance of each fingertip's surface from the cube's [m], negative inside (box SDF)."""
     outside = tips_in_object(s).abs() - s.object_half[:, None]
@@ -51,6 +53,7 @@ def surface_distance(s: Snapshot) -> Tensor:
     return sdf - TIP_RADIUS
 
 
+@derived
 def _reach(s: Snapshot) -> Tensor:
     d = surface_distance(s).clamp(min=0)
     return torch.maximum(d[:, 0], d[:, 1:].amin(-1))
@@ -60,6 +63,7 @@ def _rise(s: Snapshot) -> Tensor:
     return (lifted(s) / LIFT).clamp(0, 1)
 
 
+@derived
 def _held(s: Snapshot) -> Tensor:
     return (lifted(s) > LIFT) & opposed(s) & ~s.supported
 
@@ -142,7 +146,7 @@ PAPER_TERMS: Terms[Snapshot] = Terms(
             1.0,
             guided=True,
             doc="exp(z_current - z_candidate), z clipped at the candidate",
-        ),  # fmt: skip
+        ),
         "lift": Term(
             lambda s: torch.exp(lifted(s).clamp(0, LIFT) - LIFT) * (s.stage >= 2),
             1.0,
@@ -213,7 +217,7 @@ class CubeEnv(DoraEnv):
     STAGES = STAGES
     TERMS = TERMS
     PAPER_TERMS = PAPER_TERMS
-    EXTRA_OBSERVATIONS = {
+    EXTRA_OBSERVATIONS: ClassVar[dict[str, Entry]] = {
         "half": Entry(lambda s: s.object_half[:, :1], "m", "half edge of the cube"),
         "surface": Entry(surface_distance, "m", "distance of each fingertip's surface from the cube's", True),
     }

@@ -1,6 +1,9 @@
 """What a one-arm task reads from the simulator: one frozen record per control step, world frame, SI units."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import wraps
+from typing import Any
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -14,6 +17,10 @@ from dora.robot.rotations import (
 
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 """Finger order of every tensor with a finger axis."""
+
+
+DERIVED = "_derived"
+"""Where a snapshot keeps what `derived` functions have computed."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +83,34 @@ class Snapshot:
     correction: Float[Tensor, "n a"]
 
 
+Derived = Callable[[Snapshot], Any]
+
+
+def derived(function: Derived) -> Derived:
+    """Computes a quantity of a snapshot once, however many terms, stages and observations ask for it.
+
+    The quantity must not depend on `stage`, `phase` or `time`, which alone change when the machines advance.
+    """
+
+    @wraps(function)
+    def once(s: Snapshot) -> Any:
+        known = s.__dict__.setdefault(DERIVED, {})
+        if function not in known:
+            known[function] = function(s)
+        return known[function]
+
+    return once
+
+
+def advanced(s: Snapshot, **changes: Tensor) -> Snapshot:
+    """The snapshot with another `stage`, `phase` or `time`; what was derived from it stays."""
+    if not set(changes) <= {"stage", "phase", "time"}:
+        raise ValueError(f"only stage, phase and time may change, not {sorted(changes)}")
+    new = replace(s, **changes)
+    new.__dict__[DERIVED] = s.__dict__.get(DERIVED, {})
+    return new
+
+
 def in_wrist(s: Snapshot, point: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """World point -> hand-base frame [m]."""
     return quaternion_apply(quaternion_inverse(s.wrist_q), point - s.wrist_p)
@@ -86,23 +121,27 @@ def turned_in_wrist(s: Snapshot, vector: Float[Tensor, "n 3"]) -> Float[Tensor, 
     return quaternion_apply(quaternion_inverse(s.wrist_q), vector)
 
 
+@derived
 def tips_in_object(s: Snapshot) -> Float[Tensor, "n 5 3"]:
     """Fingertips in the object frame [m]."""
     q = quaternion_inverse(s.object_q)[:, None].expand(-1, 5, -1)
     return quaternion_apply(q, s.tip_p - s.object_p[:, None])
 
 
+@derived
 def goal_error(s: Snapshot) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Position [m] and rotation vector [rad] from the wrist to the candidate's goal, in the hand-base frame."""
     turn = quaternion_multiply(quaternion_inverse(s.wrist_q), s.goal_q)
     return in_wrist(s, s.goal_p), rotation_vector_from_quaternion(turn)
 
 
+@derived
 def lifted(s: Snapshot) -> Float[Tensor, " n"]:
     """Height of the object above its start [m]."""
     return s.object_p[:, 2] - s.start_p[:, 2]
 
 
+@derived
 def opposed(s: Snapshot) -> Bool[Tensor, " n"]:
     """The thumb and at least one more finger touch the object."""
     return s.touch[:, 0] & s.touch[:, 1:5].any(-1)
