@@ -168,14 +168,10 @@ HAND_MADE = (
 )
 THUMB_ABDUCTION = -0.003
 """Abduction of the thumb in the hand-made candidates [rad]."""
-SPREAD_FINGERS = (-0.028, -0.009, 0.009, 0.028)
-"""Abduction of index, middle, ring and pinky [rad]."""
-
-
 def _posture(fingers: tuple[float, float, float, float]) -> list[float]:
     proximal, medial, thumb_proximal, thumb_medial = fingers
     thumb = [THUMB_ABDUCTION, thumb_proximal, thumb_medial, thumb_medial]
-    return thumb + [x for a in SPREAD_FINGERS for x in (a, proximal, medial, medial)]
+    return thumb + [0.0, proximal, medial, medial] * 4
 
 
 def hand_made_candidates() -> GraspCandidates:
