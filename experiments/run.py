@@ -7,7 +7,6 @@ path is the last line printed. Ctrl-C saves; `--resume FOLDER` goes on.
 """
 
 import datetime
-import difflib
 import functools
 import shlex
 import sys
@@ -17,9 +16,14 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from dora.agents.checkpoint import read_checkpoint
 from dora.agents.config import RunConfig
+from dora.agents.play import checkpoint_path, evaluate_checkpoint, load_policy, record
 from dora.agents.presets import recommended, with_total_steps
+from dora.agents.runfolder import RunFolder, make_result
+from dora.agents.trainer import Trainer
 from dora.errors import InputError
+from dora.tasks import check_task_id, make_task
 
 VIDEO_EPISODES = 3
 INTERRUPTED = 130  # exit status after Ctrl-C
@@ -62,24 +66,6 @@ class Args:
     """End early when two successive evaluations reach this success rate, 0 to 1."""
     noise_correlation: float | None = None
     """Correlation of the exploration noise of successive steps, 0 to below 1."""
-
-
-def make(env: str, guidance: str, num_envs: int, **options: Any) -> Any:
-    """Make a task; the simulator is imported here, in the process that needs it."""
-    from dora.tasks import make_task
-
-    return make_task(env, num_envs, guidance, **options)
-
-
-def check_env(env: str) -> None:
-    """Refuse ids that are not registered, with the nearest that is."""
-    from dora.tasks import task_ids
-
-    known = task_ids()
-    if env not in known:
-        near = difflib.get_close_matches(env, known, 1, cutoff=0.0)
-        hint = f" Did you mean {near[0]}?" if near else ""
-        raise InputError(f"There is no task {env}; the tasks are {', '.join(known)}.{hint}")
 
 
 def settings(args: Args) -> RunConfig:
@@ -131,23 +117,20 @@ def default_folder(config: RunConfig, suffix: str = "") -> Path:
 
 def train(args: Args) -> tuple[Path, bool]:
     """Start or resume a run; returns its folder and whether it finished."""
-    from dora.agents.runfolder import RunFolder
-
+    if args.checkpoint is not None:
+        raise InputError("--checkpoint is only evaluated: add --eval-only, or go on with a run by --resume.")
     if args.resume is not None:
         folder = RunFolder(args.resume)
         config = resumed_settings(args, folder.read_config())
-        check_env(config.env)
+        check_task_id(config.env)
         folder.write_config(config)
     else:
         config = settings(args)
-        check_env(config.env)
+        check_task_id(config.env)
         folder = RunFolder(args.out or default_folder(config))
         folder.create(config)
-
-    from dora.agents.trainer import Trainer
-
-    make_task = functools.partial(make, config.env, config.guidance)
-    trainer = Trainer(config, make_task, folder, resume=args.resume is not None)
+    make_task_batch = functools.partial(make_task, config.env, guidance=config.guidance)
+    trainer = Trainer(config, make_task_batch, folder, resume=args.resume is not None)
     result = trainer.run()
     if not result["finished"]:
         command = ["python", *sys.argv[:1], "--resume", str(folder.path)]
@@ -159,10 +142,6 @@ def train(args: Args) -> tuple[Path, bool]:
 
 def evaluate_only(args: Args) -> Path:
     """Evaluate a checkpoint into a new run folder, which is returned."""
-    from dora.agents.checkpoint import read_checkpoint
-    from dora.agents.play import checkpoint_path, evaluate_checkpoint
-    from dora.agents.runfolder import RunFolder, make_result
-
     if args.checkpoint is None:
         raise InputError("--eval-only needs --checkpoint with a .safetensors file or a run folder.")
     path = checkpoint_path(args.checkpoint)
@@ -172,9 +151,9 @@ def evaluate_only(args: Args) -> Path:
         args.env or theirs.env, **asked, seed=theirs.seed, num_envs=theirs.num_envs, workers=theirs.workers,
         final_episodes=args.episodes, total_steps=theirs.total_steps,
     )  # fmt: skip
-    check_env(config.env)
-    make_task = functools.partial(make, config.env, config.guidance)
-    checkpoint, evaluation, zero = evaluate_checkpoint(path, config, make_task)
+    check_task_id(config.env)
+    make_task_batch = functools.partial(make_task, config.env, guidance=config.guidance)
+    checkpoint, evaluation, zero = evaluate_checkpoint(path, config, make_task_batch)
     folder = RunFolder(args.out or default_folder(config, "-eval"))
     folder.create(config)
     folder.write_evaluation(evaluation)
@@ -196,13 +175,10 @@ def evaluate_only(args: Args) -> Path:
 
 def film(checkpoint: Path, config: RunConfig, path: Path) -> None:
     """Film the policy of a checkpoint, or say in one line why not."""
-    from dora.agents.checkpoint import read_checkpoint
-    from dora.agents.play import load_policy, record
-
     policy = load_policy(read_checkpoint(checkpoint), checkpoint)
-    make_task = functools.partial(make, config.env, config.guidance, 1, render_mode="rgb_array")
+    make_single_task = functools.partial(make_task, config.env, 1, config.guidance, render_mode="rgb_array")
     try:
-        record(make_task, policy.greedy, path, VIDEO_EPISODES)
+        record(make_single_task, policy.greedy, path, VIDEO_EPISODES)
     except (RuntimeError, InputError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         print(f"No video: nothing can be rendered here ({reason}).", file=sys.stderr)

@@ -7,6 +7,9 @@ from types import ModuleType
 
 import pytest
 
+from dora.agents.presets import recommended
+from dora.agents.runfolder import RunFolder
+
 SCRIPT = Path(__file__).parent.parent / "experiments" / "run.py"
 
 
@@ -25,6 +28,8 @@ def script() -> ModuleType:
     ("arguments", "words"),
     [
         ("", "--env"),
+        ("--env Nope-v1", "unknown environment 'Nope-v1'"),
+        ("--env DoraCub-v1", "did you mean DoraCube-v1?"),
         ("--env DoraCube-v1 --num-envs 0", "--num-envs is 0"),
         ("--env DoraCube-v1 --total-steps -5", "--total-steps is -5"),
         ("--env DoraCube-v1 --workers -1", "--workers is -1"),
@@ -33,6 +38,7 @@ def script() -> ModuleType:
         ("--resume /nowhere", "not a run folder"),
         ("--eval-only", "--checkpoint"),
         ("--eval-only --checkpoint /nowhere.safetensors", "no checkpoint"),
+        ("--env DoraCube-v1 --checkpoint missing", "--eval-only"),
     ],
 )
 def test_bad_input(
@@ -61,9 +67,6 @@ def test_errors_of_the_parser(script: ModuleType, monkeypatch: pytest.MonkeyPatc
 def test_resume_refuses_another_task(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    from dora.agents.presets import recommended
-    from dora.agents.runfolder import RunFolder
-
     RunFolder(tmp_path).create(recommended("DoraCube-v1", "ppo"))
     monkeypatch.setattr(sys, "argv", ["run.py", "--resume", str(tmp_path), "--env", "DoraJug-v1"])
     assert script.main() == 2

@@ -58,7 +58,8 @@ def test_touching_hand_equals_stock():
     """The sensed impulses are equal up to rounding: stock takes their norm in float64 on a CPU."""
     env_id = "RotateSingleObjectInHandLevel0-v1"
     stock, ours = make(env_id, "physx_cpu"), make(env_id, dora.sim.BACKEND)
-    stock.reset(seed=0), ours.reset(seed=0)
+    stock.reset(seed=0)
+    ours.reset(seed=0)
     stock.action_space.seed(0)
     for _ in range(STEPS):
         action = stock.action_space.sample()

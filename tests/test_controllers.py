@@ -27,14 +27,14 @@ def task() -> Iterator[DoraEnv]:
 
 
 def command(task: DoraEnv, wrist: torch.Tensor) -> torch.Tensor:
-    hand = task.agent.controller.hand_action(task.snapshot.hand_target)
+    hand = task.agent.wrist_controller.hand_action(task.snapshot.hand_target)
     return torch.cat([wrist, hand], -1)
 
 
 def test_the_wrist_follows_a_path(task: DoraEnv, record_property):
     task.reset(seed=0)
     start_p, start_q = task.snapshot.wrist_p.clone(), task.snapshot.wrist_q.clone()
-    controller, shifts, turns = task.agent.controller, [], []
+    controller, shifts, turns = task.agent.wrist_controller, [], []
     for t in range(PATH_STEPS + 8):
         phase = torch.tensor(2 * pi * min(t, PATH_STEPS) / PATH_STEPS)
         goal_p = start_p + PATH_RADIUS * torch.stack([phase.cos() - 1, phase.sin(), phase.sin() / 2])
@@ -57,7 +57,7 @@ def test_the_wrist_follows_a_path(task: DoraEnv, record_property):
 @pytest.mark.parametrize("direction", [0, 1, 2])
 def test_out_of_reach_and_singular_poses_stay_finite_and_within_limits(task: DoraEnv, direction: int):
     task.reset(seed=0)
-    arm, controller = task.agent.description.arm, task.agent.controller
+    arm, controller = task.agent.description.arm, task.agent.wrist_controller
     push = torch.zeros(4, 6)
     push[:, direction] = torch.tensor([1.0, -1.0, 1.0, -1.0])
     push[2:, 3 + direction] = 1.0
@@ -76,7 +76,7 @@ def test_out_of_reach_and_singular_poses_stay_finite_and_within_limits(task: Dor
 
 def test_hand_targets_reach_what_was_asked_no_faster_than_allowed(task: DoraEnv):
     task.reset(seed=0)
-    controller, hand = task.agent.controller, task.agent.description.hand
+    controller, hand = task.agent.wrist_controller, task.agent.description.hand
     action = torch.zeros(4, task.action_size)
     action[:, 6:] = 1.0
     limit = torch.tensor(hand.velocity, dtype=torch.float32) / task.CONTROL_FREQUENCY
@@ -88,7 +88,7 @@ def test_hand_targets_reach_what_was_asked_no_faster_than_allowed(task: DoraEnv)
 
 
 def test_an_action_asks_for_the_joints_it_was_made_from(task: DoraEnv):
-    controller = task.agent.controller
+    controller = task.agent.wrist_controller
     joints = torch.rand(3, 20) * (controller.hand_upper - controller.hand_lower) + controller.hand_lower
     action = controller.hand_action(joints)
     back = controller.hand_lower + (action / 2 + 0.5) * (controller.hand_upper - controller.hand_lower)

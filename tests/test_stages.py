@@ -105,7 +105,7 @@ def test_terms_add_up_and_know_their_bounds():
         }
     )
     total, parts = terms(state([0.0, 9.0], [0.5, 1.0]))
-    assert torch.equal(total, sum(parts.values()))
+    assert torch.equal(total, torch.stack(list(parts.values())).sum(0))
     assert total[0] == 1.5
     assert (terms.lower, terms.upper) == (-1.0, 2.0)
 

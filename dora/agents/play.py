@@ -14,8 +14,9 @@ from dora.agents.checkpoint import Checkpoint, check_belongs, read_checkpoint, u
 from dora.agents.config import RunConfig
 from dora.agents.env import Task, TaskEnv
 from dora.agents.evaluate import FINAL_SEED, Act, Evaluation, evaluate
+from dora.agents.learner import make_learner
 from dora.agents.networks import Policy
-from dora.agents.trainer import MakeTask, make_learner
+from dora.agents.trainer import MakeTask
 
 FRAMES_PER_SECOND = 20  # of a film, if the task does not say its control frequency
 

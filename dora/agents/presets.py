@@ -8,8 +8,21 @@ from dora.agents.config import GUIDANCES, LEARNER_CONFIGS, SINGLE_ARM_AGENTS, Ru
 from dora.errors import InputError
 
 PRESETS: dict[tuple[str, str], dict[str, Any]] = {
-    ("DoraCube-v1", "ppo"): {"total_steps": 200_000, "num_envs": 32, "eval_every": 50_000},
-    ("DoraCube-v1", "sac"): {"total_steps": 150_000, "num_envs": 32, "eval_every": 50_000},
+    ("DoraCube-v1", "ppo"): {
+        "total_steps": 200_000,
+        "num_envs": 64,
+        "eval_every": 50_000,
+        "eval_episodes": 50,
+        "eval_envs": 50,
+        "learner": {"rollout": 16, "log_std": -1.0},
+    },
+    ("DoraCube-v1", "sac"): {
+        "total_steps": 150_000,
+        "num_envs": 32,
+        "eval_every": 50_000,
+        "eval_episodes": 50,
+        "eval_envs": 50,
+    },
 }
 """Differences from the defaults of `RunConfig`, and under `learner` from those of the learner."""
 

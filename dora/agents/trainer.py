@@ -4,13 +4,12 @@ import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from dora.agents.checkpoint import (
     Checkpoint,
@@ -24,62 +23,20 @@ from dora.agents.checkpoint import (
     unpack_rng,
 )
 from dora.agents.collect import Rollouts
-from dora.agents.config import PPOConfig, RunConfig
+from dora.agents.config import RunConfig
 from dora.agents.env import EpisodeColumns, Task, TaskEnv, ended_episodes
 from dora.agents.evaluate import FINAL_SEED, PERIODIC_SEED, Evaluation, evaluate
 from dora.agents.interrupt import Interrupt
+from dora.agents.learner import Learner, make_learner
 from dora.agents.logging import RunLog
-from dora.agents.networks import Policy
-from dora.agents.ppo import PPO
 from dora.agents.progress import ProgressReport
-from dora.agents.replay import Replay
 from dora.agents.runfolder import RunFolder, make_result
-from dora.agents.sac import SAC
 
 TRAINING_SEEDS = 1_000_000_000  # seeds of training are below, those of evaluation above
 RECENT = 200  # training episodes over which the shown success rate is taken
 
 MakeTask = Callable[[int], Task]
 """Makes a task with the given number of environments; picklable."""
-
-
-@runtime_checkable
-class Learner(Protocol):
-    """What the training loop needs of an algorithm."""
-
-    policy: Policy
-    rollout: int
-    replay: Replay | None
-
-    @property
-    def modules(self) -> dict[str, nn.Module]:
-        """Networks and normaliser."""
-        ...
-
-    @property
-    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Optimisers."""
-        ...
-
-    def update(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from a batch (N, T) of fresh transitions; losses and other values by name."""
-        ...
-
-    def counters(self) -> dict[str, float]:
-        """Numbers besides the modules' that a checkpoint has to keep."""
-        ...
-
-    def set_counters(self, counters: dict[str, float]) -> None:
-        """Restore `counters`."""
-        ...
-
-
-def make_learner(config: RunConfig, observation: int, action: int) -> PPO | SAC:
-    """The learner of a run, with weights drawn from torch's global generator."""
-    settings = config.learner
-    if isinstance(settings, PPOConfig):
-        return PPO(settings, observation, action, config.normaliser_samples)
-    return SAC(settings, observation, action, config.normaliser_samples)
 
 
 def seeds_for(seed: int, step: int, count: int) -> list[int]:
@@ -129,7 +86,7 @@ class Trainer:
         )
         weights_seed, self._exploration_seed = seeds_for(config.seed, 0, 2)
         torch.manual_seed(weights_seed)
-        self.learner: PPO | SAC = make_learner(config, *self.sizes)
+        self.learner: Learner = make_learner(config, *self.sizes)
         torch.manual_seed(self._exploration_seed)
         self._recent = torch.zeros(0, len(self.columns.names))
         self._resumed: dict[str, Tensor] | None = None

@@ -159,8 +159,7 @@ def _single_env(env_id: str) -> gym.Env:
 
 
 def _reference_rate(env_id: str, processes: int, seconds: float) -> float:
-    """Environment steps per second of an `AsyncVectorEnv`, which resets ended episodes within the step as
-    ours does."""
+    """Environment steps per second of an `AsyncVectorEnv`, which resets ended episodes within the step as ours."""
     makers = [lambda: _single_env(env_id)] * processes
     env = AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
     try:

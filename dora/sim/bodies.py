@@ -1,6 +1,7 @@
 """Poses and velocities of chosen bodies in one tensor, on every backend."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -38,5 +39,6 @@ class BodyReader:
 
     def _gather(self, columns: slice) -> Tensor:
         if self._index is None:  # bodies have no rows before the scene is complete
-            self._index = torch.stack([b._body_data_index for b in self.bodies], 1).long()
-        return self.scene.px.cuda_rigid_body_data.torch()[self._index, columns]
+            self._index = torch.stack([torch.as_tensor(b._body_data_index) for b in self.bodies], 1).long()
+        system: Any = self.scene.px  # PhysX's GPU system or BatchSystem
+        return system.cuda_rigid_body_data.torch()[self._index, columns]

@@ -19,11 +19,9 @@ class Contacts:
     """Contacts among g groups of bodies in n environments.
 
     Attributes:
-        impulse: sum over contact points of the impulse on group i by group j [N s], world frame.
-        Antisymmetric in
+        impulse: sum over contact points of the impulse on group i by group j [N s], world frame. Antisymmetric in
             the groups; contacts inside a group add up to 0.
-        separation: smallest distance over the contact points of two groups [m]: negative is penetration,
-        +inf means
+        separation: smallest distance over the contact points of two groups [m]: negative is penetration, +inf means
             that PhysX reports no contact between them. Symmetric. NaN on a GPU, which does not report it.
     """
 
@@ -144,14 +142,11 @@ class _GroupScanner(ContactScanner):
         self._count = len(groups)
         self._group_of: dict[int, int] = {}
         members = [member for group in groups.values() for member in group]
-        self._kept_alive = [body for member in members for body in member._bodies]
-        for group, (name, members) in enumerate(groups.items()):
-            for member in members:
-                for body in member._bodies:
-                    if self._group_of.setdefault(id(body), group) != group:
-                        raise InputError(
-                            f"{member.name} is in group {name} and in another one: leave it in one of them."
-                        )
+        self._kept_alive = [body for member in members for body in member._bodies]  # an id may be used anew otherwise
+        for index, (name, group) in enumerate(groups.items()):
+            for member in group:
+                if any(self._group_of.setdefault(id(body), index) != index for body in member._bodies):
+                    raise InputError(f"{member.name} is in group {name} and in another one: leave it in one of them.")
         self.clear()
 
     def clear(self) -> None:
@@ -161,8 +156,7 @@ class _GroupScanner(ContactScanner):
         self._separations: list[float] = []
 
     def take(self, environment: int, contacts: list) -> None:
-        """Collect the points between groups: slot (environment, first, second), impulse on the first,
-        separation."""
+        """Collect the points between groups: slot (environment, first, second), impulse on the first, separation."""
         group_of, count, wanted = self._group_of.get, self._count, self._wanted
         for contact in contacts:
             first, second = contact.bodies

@@ -4,6 +4,7 @@ One law on every backend, in batched torch, on *commanded* joints: contact force
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -150,7 +151,8 @@ class WristHandController(BaseController):
         self.target = self.target.index_copy(0, rows, target)
         self.articulation.set_joint_drive_targets(self.target, self.joints, self.active_joint_indices)
         if self.scene.gpu_sim_enabled:
-            self.scene.px.gpu_apply_articulation_target_position()
+            system: Any = self.scene.px  # PhysX's GPU system or BatchSystem
+            system.gpu_apply_articulation_target_position()
 
 
 @dataclass
@@ -182,7 +184,7 @@ class CoupledJointPosController(PDJointPosController):
 
     def set_action(self, action: Float[Tensor, "n a"]) -> None:
         """Sends absolute targets [rad], or targets relative to the measured joints."""
-        asked = self._preprocess_action(action)
+        asked = torch.as_tensor(self._preprocess_action(action))
         if self.config.use_delta:
             asked = self.qpos[:, self.actuated] + asked
         hand = self.config.robot.expand_hand(asked[:, self.arm_size :])

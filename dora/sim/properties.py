@@ -30,7 +30,7 @@ class ObjectProperties:
         for row, m, f in zip(rows, mass, friction, strict=True):
             body = self.bodies[row]
             body.set_mass(m)
-            body.set_inertia(self._inertia[row] * (m / self.nominal[row]))
+            body.set_inertia((self._inertia[row] * (m / self.nominal[row])).tolist())
             for material in self._materials[row]:
                 material.static_friction = f
                 material.dynamic_friction = f

@@ -17,7 +17,7 @@ from dora.errors import InputError
 from dora.robot import RobotDescription, available_robots, load_robot
 from dora.robot.kinematics import SerialChain
 from dora.robot.rotations import quaternion_apply, quaternion_from_matrix, quaternion_multiply
-from dora.sim.controllers import CoupledJointPosConfig, WristHandConfig
+from dora.sim.controllers import CoupledJointPosConfig, WristHandConfig, WristHandController
 
 CONTROL_MODES = ("wrist_delta_hand_pos", "pd_joint_pos", "pd_joint_delta_pos")
 """Control modes of every robot, the default first; each exists with the suffix COUPLED as well."""
@@ -81,11 +81,28 @@ class DescribedRobot(BaseAgent):
         self.distals: list[Link] = [links[f.distal] for f in d.fingers.values()]
         self._tip_p, self._tip_q = (x.to(self.device) for x in self._tip_frames())
         self.finger_links: list[list[Link]] = [[links[n] for n in f.links] for f in d.fingers.values()]
-        self.hand_index = [self.robot.active_joints_map[n].active_index[0].item() for n in d.hand.names]
-        self.arm_index = [self.robot.active_joints_map[n].active_index[0].item() for n in d.arm.names]
+        joints = self.robot.active_joints_map
+        self.hand_index = [int(joints[n].active_index[0]) for n in d.hand.names]
+        self.arm_index = [int(joints[n].active_index[0]) for n in d.arm.names]
         self.keyframes = {
             name: Keyframe(pose=sapien.Pose(), qpos=self.qpos_of(p.arm, p.hand)) for name, p in d.postures.items()
         }
+
+    @property
+    def commands_wrist(self) -> bool:
+        """Whether the active control mode is one of `WristHandController`."""
+        return isinstance(self.controller, WristHandController)
+
+    @property
+    def wrist_controller(self) -> WristHandController:
+        """The active controller.
+
+        Raises:
+            InputError: if the control mode commands joints instead of the wrist.
+        """
+        if not isinstance(controller := self.controller, WristHandController):
+            raise InputError(f"the control mode {self.control_mode!r} commands no wrist: use {CONTROL_MODES[0]!r}")
+        return controller
 
     def _tip_frames(self) -> tuple[Tensor, Tensor]:
         """Fingertip frames in their distal links: (f, 3) [m], (f, 4) wxyz."""

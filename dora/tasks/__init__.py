@@ -15,6 +15,14 @@ def task_ids() -> list[str]:
     return sorted(i for i in gym.registry if i.startswith("Dora"))
 
 
+def check_task_id(env_id: str) -> None:
+    """Refuses ids that are not registered with an InputError, which names the nearest one that is."""
+    if env_id not in task_ids():
+        near = difflib.get_close_matches(env_id, task_ids(), 1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise InputError(f"unknown environment {env_id!r}{hint} (known: {', '.join(task_ids())})")
+
+
 def make_task(env_id: str, num_envs: int, guidance: str = "affordance", **options: Any) -> DoraEnv:
     """A bare batched task (no gymnasium wrappers), for learners.
 
@@ -27,12 +35,8 @@ def make_task(env_id: str, num_envs: int, guidance: str = "affordance", **option
     Raises:
         InputError: for an unknown id, or any option the task refuses.
     """
-    if env_id not in task_ids():
-        near = difflib.get_close_matches(env_id, task_ids(), 1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        raise InputError(f"unknown environment {env_id!r}{hint} (known: {', '.join(task_ids())})")
-    options = {"obs_mode": "state", "reward_mode": "dense"} | options
-    backend = {"sim_backend": "physx_cpu_batch"} if "sim_backend" not in options else {}
-    task = gym.make(env_id, num_envs=num_envs, guidance=guidance, **backend, **options).unwrapped
+    check_task_id(env_id)
+    options = {"obs_mode": "state", "reward_mode": "dense", "sim_backend": "physx_cpu_batch"} | options
+    task = gym.make(env_id, num_envs=num_envs, guidance=guidance, **options).unwrapped
     assert isinstance(task, DoraEnv)
     return task

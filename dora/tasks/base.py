@@ -1,14 +1,13 @@
 """Base of every one-arm Dora task: reads the simulator once per control step, then only pure tensor code decides."""
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any, ClassVar, cast
 
 import gymnasium as gym
 import numpy as np
 import sapien
 import torch
-from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Actor
@@ -17,27 +16,21 @@ from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
 from dora.errors import InputError
-from dora.sim.bodies import BodyReader
-from dora.sim.contacts import ContactMonitor
-from dora.sim.controllers import WristHandController
 from dora.sim.properties import ObjectProperties
 from dora.sim.robot import DescribedRobot
 from dora.tasks.episode import Episode
 from dora.tasks.guidance import GraspReference, Target, wrist_step
-from dora.tasks.observations import OBSERVATIONS, Entry
+from dora.tasks.judging import JudgedEnv
 from dora.tasks.options import check_options
-from dora.tasks.rewards import Terms
+from dora.tasks.reading import SimulatorReader
 from dora.tasks.scene import add_table
-from dora.tasks.snapshot import FINGERS, Snapshot, advanced
-from dora.tasks.stages import Stage, StageMachine
+from dora.tasks.snapshot import Snapshot, advanced
 
 CANDIDATE_DRAWS = 26
 """Random numbers of a candidate's error: 3 position, 3 rotation, 20 joints."""
-MM = 1000.0
-"""Millimetres per metre."""
 
 
-class DoraEnv(BaseEnv):
+class DoraEnv(JudgedEnv):
     """A task is `STAGES`, `TERMS`, `place` (random numbers -> initial state), an object and its candidates.
 
     Args:
@@ -53,23 +46,10 @@ class DoraEnv(BaseEnv):
         InputError: for an unknown guidance, hand, preset, robot or control mode, or num_envs < 1.
     """
 
-    SUPPORTED_REWARD_MODES = ("dense", "normalized_dense", "sparse", "none", "paper")
     SUPPORTED_ROBOTS: ClassVar[list[str]] = ["diana7_hit"]
 
-    STAGES: ClassVar[Sequence[Stage[Snapshot]]]
-    """The sub-tasks, in order."""
-    TERMS: ClassVar[Terms[Snapshot]]
-    """The reward's terms."""
-    PAPER_TERMS: ClassVar[Terms[Snapshot]]
-    """The printed reward, corrected (`reward_mode="paper"`)."""
-    EXTRA_OBSERVATIONS: ClassVar[Mapping[str, Entry]] = {}
-    """Observation entries beyond `OBSERVATIONS`."""
     DRAWS: ClassVar[int]
     """How many uniform random numbers one initial state needs, besides the candidate's error."""
-    MAX_STEPS: ClassVar[int]
-    """Episode limit [control steps]."""
-    DEEPEST: ClassVar[float] = 0.005
-    """Penetration that spoils an episode [m]."""
     CONTROL_FREQUENCY: ClassVar[int] = 20
     """Control steps per second [Hz]."""
     PHYSICS_FREQUENCY: ClassVar[int] = 100
@@ -157,25 +137,12 @@ class DoraEnv(BaseEnv):
         self.table = add_table(self.scene)
         self.scale = self._forced_scale if self._forced_scale is not None else self._draw_scale()
         self.target_object = self.load_object(self.scale.cpu().numpy())
-        agent, device, n = self.agent, self.device, self.num_envs
-        self.machine = StageMachine(self.STAGES, n, device)
-        self.reference = GraspReference(self.candidates(), n, self.action_size, device)
-        self.episode = Episode(n, self.action_size, device)
-        self._terms = self.PAPER_TERMS if self._reward_mode == "paper" else self.TERMS
-        if not self.guided:
-            self._terms = self._terms.without_guidance()
-        entries = {**OBSERVATIONS, **self.EXTRA_OBSERVATIONS}
-        self.observation_entries = {k: e for k, e in entries.items() if self.guided or not e.guided}
-        self._poses = BodyReader(self.scene, [agent.wrist, *agent.distals, self.target_object])
-        self._velocities = BodyReader(self.scene, [agent.wrist, self.target_object])
-        groups = dict(zip(FINGERS, agent.finger_links, strict=True)) | {"palm": [agent.palm]}
-        pairs = [(part, other) for part in groups for other in ("object", "world")] + [("object", "world")]
-        groups |= {"object": [self.target_object], "world": [self.table]}
-        self._contacts = ContactMonitor(self.scene, groups, pairs)
+        self._reader = SimulatorReader(self.scene, self.agent, self.target_object, self.table)
         self._properties = ObjectProperties(self.target_object)
-        self._hand_index = torch.tensor(agent.hand_index, device=device)
-        self._arm_index = torch.tensor(agent.arm_index, device=device)
-        self._home = agent.posture_wrist("home")
+        self._load_judgement()
+        self.reference = GraspReference(self.candidates(), self.num_envs, self.action_size, self.device)
+        self.episode = Episode(self.num_envs, self.action_size, self.device)
+        self._home = self.agent.posture_wrist("home")
 
     def _draw_scale(self) -> Tensor:
         """(n,) relative sizes, one draw from each environment's own stream."""
@@ -185,25 +152,7 @@ class DoraEnv(BaseEnv):
     @property
     def action_size(self) -> int:
         """Number of action components."""
-        return int(np.prod(self.agent.single_action_space.shape))
-
-    # ------------------------------------------------ the protocol of learners
-
-    @property
-    def max_steps(self) -> int:
-        """Episode limit [control steps]."""
-        return self.MAX_STEPS
-
-    @property
-    def stage_names(self) -> tuple[str, ...]:
-        """Names of the stages, in order."""
-        return tuple(stage.name for stage in self.STAGES)
-
-    @property
-    def logged(self) -> tuple[str, ...]:
-        """Names of the (n,) tensors in `step`'s info that are worth a curve."""
-        stages = [f"stage/{name}" for name in self.stage_names]
-        return (*(f"reward/{name}" for name in self._terms.terms), *stages, "penetration_mm", "finished")
+        return int(np.prod(self.agent.single_action_space.shape or ()))
 
     # ---------------------------------------------------------------- reading
 
@@ -215,32 +164,12 @@ class DoraEnv(BaseEnv):
         return self._snapshot
 
     def _read(self) -> Snapshot:
-        pose, velocity = self._poses.poses(), self._velocities.velocities()
-        p, q, v, w = pose[..., :3], pose[..., 3:], velocity[..., :3], velocity[..., 3:]
-        qpos, qvel = self.agent.robot.get_qpos(), self.agent.robot.get_qvel()
-        tip_p, tip_q = self.agent.tips_of(p[:, 1:6], q[:, 1:6])
-        e, r, hand_q = self.episode, self.reference, qpos[:, self._hand_index]
-        goal_p, goal_q = r.goal(p[:, 6], q[:, 6])
-        controller = self.agent.controller
-        commanded = isinstance(controller, WristHandController) and len(controller.target)
-        return Snapshot(
-            arm_q=qpos[:, self._arm_index], hand_q=hand_q, hand_v=qvel[:, self._hand_index],
-            hand_target=controller.target[:, controller.arm_size :] if commanded else hand_q,
-            wrist_p=p[:, 0], wrist_q=q[:, 0], wrist_v=v[:, 0], wrist_w=w[:, 0], tip_p=tip_p, tip_q=tip_q,
-            object_p=p[:, 6], object_q=q[:, 6], object_v=v[:, 1], object_w=w[:, 1],
-            object_half=self.object_half, start_p=e.start_p.clone(),
-            touch=e.touch > 0, force=e.force.clone(), supported=e.supported > 0,
-            penetration=e.penetration.clone(), deepest=e.deepest.clone(),
-            stage=self.machine.index.clone(), time=self._elapsed_steps / self.MAX_STEPS,
-            action=e.action.clone(), previous_action=e.previous_action.clone(),
-            goal_p=goal_p, goal_q=goal_q,
-            goal_pregrasp=r.buffers["pregrasp"].clone(), goal_grasp=r.buffers["grasp"].clone(),
-            phase=r.phase.index.clone(), correction=r.buffers["correction"].clone(),
-        )  # fmt: skip
+        time = self._elapsed_steps / self.MAX_STEPS
+        return self._reader.snapshot(self.machine, self.reference, self.episode, self.object_half, time)
 
     # ------------------------------------------------------------------ reset
 
-    def reset(self, seed: Any = None, options: dict | None = None) -> tuple[Any, dict]:
+    def reset(self, seed: int | Sequence[int] | None = None, options: dict | None = None) -> tuple[Any, dict[str, Any]]:
         """As in ManiSkill, but a seeded reset builds the scene anew: PhysX remembers earlier contacts, and would
         not repeat a trajectory bit for bit otherwise. A partial reset (`options["env_idx"]`) takes no seed.
 
@@ -249,11 +178,12 @@ class DoraEnv(BaseEnv):
         """
         if seed is not None and options and "env_idx" in options:
             raise InputError("a partial reset (env_idx) cannot take a seed: it would reseed every environment")
-        gym.Env.reset(self, seed=seed[0] if isinstance(seed, list | tuple) else seed)  # gymnasium's own generator
+        seeds = seed if seed is None or isinstance(seed, int) else list(seed)
+        gym.Env.reset(self, seed=seeds[0] if isinstance(seeds, list) else seeds)  # gymnasium's own generator
         self._snapshot = None
         if seed is not None and "reset_to_env_states" not in (options or {}):
             options = {**(options or {}), "reconfigure": True}
-        return super().reset(seed=seed, options=options)
+        return super().reset(seed=seeds, options=options)
 
     def _initialize_episode(self, env_idx: Tensor, options: dict) -> None:
         # One draw per environment from its own stream: neither num_envs nor the others' resets change it.
@@ -264,9 +194,9 @@ class DoraEnv(BaseEnv):
         home = self.agent.description.postures["home"]
         qpos = torch.from_numpy(self.agent.qpos_of(home.arm, home.hand)).to(self.device)
         self.agent.robot.set_qpos(qpos.expand(len(env_idx), -1))
-        if isinstance(self.agent.controller, WristHandController):
+        if self.agent.commands_wrist:
             joints = torch.tensor(np.concatenate([home.arm, home.hand]), dtype=torch.float32, device=self.device)
-            self.agent.controller.begin(env_idx, joints.expand(len(env_idx), -1))
+            self.agent.wrist_controller.begin(env_idx, joints.expand(len(env_idx), -1))
         self.place(env_idx, place)
         pose, e, rows = self.target_object.pose, self.episode, len(env_idx)
         e.begin(env_idx, pose.p[env_idx])
@@ -288,12 +218,23 @@ class DoraEnv(BaseEnv):
 
     # ------------------------------------------------------------------- step
 
+    def step(self, action: Any) -> tuple[Any, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """One control step with the action (n, a), or (a,) for one environment; None moves no command.
+
+        Returns:
+            Observation ((n, o) with `obs_mode="state"`), reward (n,), terminated (n,), truncated (n,) and info.
+
+        Raises:
+            InputError: if the action has another shape, or holds NaN or infinity; nothing is moved then.
+        """
+        return super().step(action)
+
     def _step_action(self, action: Any) -> Any:
         action = self._checked(action)
         if action is not None:
             self.episode.record_action(action)
         super()._step_action(None if action is None else self._command(action))
-        self.episode.record_contacts(self._contacts.read(), self.PHYSICS_FREQUENCY)
+        self.episode.record_contacts(self._reader.contacts(), self.PHYSICS_FREQUENCY)
         s = self._read()
         self.machine.advance(s)
         self.reference.advance(s)
@@ -321,16 +262,16 @@ class DoraEnv(BaseEnv):
 
     def _command(self, action: Tensor) -> Tensor:
         """What the controller is asked: the action itself, or the corrected reference if guided."""
-        controller = self.agent.controller
-        if not (self.guided and isinstance(controller, WristHandController)):
+        if not (self.guided and self.agent.commands_wrist):
             return action
-        target = self.reference.target(self.snapshot)
-        return self._encode(self.reference.corrected(target, action.clamp(-1, 1), controller.expand_hand))
+        target, expand = self.reference.target(self.snapshot), self.agent.wrist_controller.expand_hand
+        return self._encode(self.reference.corrected(target, action.clamp(-1, 1), expand))
 
     def _encode(self, target: Target) -> Tensor:
         """A wrist and hand target as an action of the wrist controller."""
-        controller = self.agent.controller
-        step = wrist_step(target.wrist_p, target.wrist_q, *controller.wrist(), controller.wrist_limits)
+        controller = self.agent.wrist_controller
+        from_p, from_q = controller.wrist()
+        step = wrist_step(target.wrist_p, target.wrist_q, from_p, from_q, controller.wrist_limits)
         return torch.cat([step, controller.hand_action(target.hand)], -1)
 
     def scripted_action(self) -> Tensor:
@@ -345,69 +286,13 @@ class DoraEnv(BaseEnv):
         self.reference.aim(target)
         return self._encode(target)
 
-    # ---------------------------------------------------- evaluation, reward
-
-    @property
-    def spoiled(self) -> Tensor:
-        """(n,) bool: the episode's deepest penetration is above the task's limit."""
-        return self.episode.deepest > self.DEEPEST
-
-    def evaluate(self) -> dict[str, Tensor]:
-        """Idempotent: reset and wrappers call it too, so it moves nothing."""
-        finished = self.machine.finished
-        info = {
-            "success": finished & ~self.spoiled,
-            "fail": self.failed(self.snapshot),
-            "finished": finished,
-            "stage": self.machine.index.clone(),
-            "penetration_mm": self.episode.penetration * MM,
-            "penetration_max_mm": self.episode.deepest * MM,
-        }
-        for k, stage in enumerate(self.machine.stages):
-            info[f"stage/{stage.name}"] = self.machine.furthest > k
-        return info
-
-    def failed(self, s: Snapshot) -> Tensor:
-        """(n,) bool: the object has left the table or the robot's reach; nothing can mend the episode."""
-        away = (s.object_p[:, :2] - s.start_p[:, :2]).norm(dim=-1)
-        return (s.object_p[:, 2] < -0.05) | (away > 0.6)
-
-    def compute_dense_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
-        """Sum of the terms (n,); each one's share goes into `info["reward/<name>"]`."""
-        total, parts = self._terms(self.snapshot)
-        info.update({f"reward/{name}": value for name, value in parts.items()})
-        return total
-
-    def compute_normalized_dense_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
-        """The dense reward over its largest possible value."""
-        return self.compute_dense_reward(obs, action, info) / self._terms.upper
-
-    def get_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
-        """(n,) reward of the chosen mode; "paper" sums the printed terms."""
-        if self._reward_mode == "paper":
-            return self.compute_dense_reward(obs, action, info)
-        return super().get_reward(obs, action, info)
-
-    # ----------------------------------------------------------- observation
-
-    def _get_obs_agent(self) -> dict[str, Tensor]:
-        return {}
-
-    def _get_obs_extra(self, info: dict) -> dict[str, Tensor]:
-        s = self.snapshot
-        return {name: entry.value(s) for name, entry in self.observation_entries.items()}
-
-    def _flatten_raw_obs(self, obs: Any) -> Any:
-        if self._obs_mode == "state":
-            return torch.cat(list(obs["extra"].values()), -1)
-        return super()._flatten_raw_obs(obs)
-
     # ------------------------------------------------------------------ state
 
     def get_state_dict(self) -> dict:
         """Simulator, controller and task state; a round trip restores stage and observation."""
         task = self.episode.get_state() | {"elapsed": self._elapsed_steps.clone(), "scale": self.scale.clone()}
-        return super().get_state_dict() | {
+        simulation = cast(dict[str, Any], super().get_state_dict())  # annotated as a tensor
+        return simulation | {
             "task": task,
             "machine": self.machine.get_state(),
             "reference": self.reference.get_state(),
@@ -421,10 +306,10 @@ class DoraEnv(BaseEnv):
         rows = torch.arange(self.num_envs, device=self.device) if env_idx is None else env_idx
         if "task" in state:
             self._rebuild(state["task"]["scale"].reshape(-1), rows)
-        super().set_state_dict({k: state[k] for k in ("actors", "articulations")}, env_idx)
-        controller = self.agent.controller
-        if "controller" in state and isinstance(controller, WristHandController):
-            controller.restore(state["controller"]["target"], rows)
+        partial = {} if env_idx is None else {"env_idx": env_idx}
+        super().set_state_dict({k: state[k] for k in ("actors", "articulations")}, **partial)
+        if "controller" in state and self.agent.commands_wrist:
+            self.agent.wrist_controller.restore(state["controller"]["target"], rows)
         if "task" in state:
             self.episode.set_state(state["task"], rows)
             self._elapsed_steps[rows] = state["task"]["elapsed"].reshape(-1).to(self._elapsed_steps.dtype)

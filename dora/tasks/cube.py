@@ -107,6 +107,10 @@ def _lift(s: Snapshot) -> Tensor:
     return _rise(s) * (0.3 + 0.7 * opposed(s).float())
 
 
+def _clean(s: Snapshot) -> Tensor:
+    return (_held(s) & (s.deepest <= DEEPEST)).float()
+
+
 def _deep(s: Snapshot) -> Tensor:
     return ((s.penetration - 0.0005) / DEEPEST).clamp(0, 1)
 
@@ -126,7 +130,7 @@ TERMS: Terms[Snapshot] = Terms(
         "reach": Term(lambda s: closeness(_reach(s), 0.0, 0.25), 0.3, doc="thumb and one finger near the cube"),
         "grasp": Term(_grasp, 0.4, doc="contacts: thumb against a finger, and how many fingers"),
         "lift": Term(_lift, 3.0, doc="rise, saturating at the target height"),
-        "held": Term(lambda s: _held(s).float(), 1.5, doc="lifted, opposed and off the table"),
+        "held": Term(_clean, 1.5, doc="lifted, opposed, off the table, and no overlap above 3 mm so far"),
         "effort": Term(_effort, -0.05, "penalty", doc="mean square of the action"),
         "change": Term(_change, -0.4, "penalty", doc="mean square of the action's change"),
         "penetration": Term(_deep, -1.0, "penalty", doc="overlap beyond 0.5 mm"),
@@ -168,6 +172,8 @@ HAND_MADE = (
 )
 THUMB_ABDUCTION = -0.003
 """Abduction of the thumb in the hand-made candidates [rad]."""
+
+
 def _posture(fingers: tuple[float, float, float, float]) -> list[float]:
     proximal, medial, thumb_proximal, thumb_medial = fingers
     thumb = [THUMB_ABDUCTION, thumb_proximal, thumb_medial, thumb_medial]
@@ -175,7 +181,7 @@ def _posture(fingers: tuple[float, float, float, float]) -> list[float]:
 
 
 def hand_made_candidates() -> GraspCandidates:
-    """Two top grasps, each turned by quarter turns about the vertical: the cube looks the same after each."""
+    """One top grasp, turned by quarter turns about the vertical: the cube looks the same after each."""
     position, quaternion, pre, grasp = [], [], [], []
     # With pitch 0 the fingers (hand z) point along +x and the palm (hand x) faces down.
     level = torch.tensor([cos(pi / 4), 0.0, sin(pi / 4), 0.0])
@@ -231,12 +237,12 @@ class CubeEnv(DoraEnv):
             builder = self.scene.create_actor_builder()
             # A material of its own: without one, every shape of every environment shares SAPIEN's default.
             material = PhysxMaterial(FRICTION, FRICTION, 0.0)
-            builder.add_box_collision(half_size=[half] * 3, material=material, density=MASS / (2 * half) ** 3)
+            builder.add_box_collision(half_size=(half,) * 3, material=material, density=MASS / (2 * half) ** 3)
             if self.scene.can_render():
                 paint = sapien.render.RenderMaterial(base_color=[0.85, 0.25, 0.15, 1.0], roughness=0.5)
-                builder.add_box_visual(half_size=[half] * 3, material=paint)
+                builder.add_box_visual(half_size=(half,) * 3, material=paint)
             builder.set_scene_idxs([i])
-            builder.initial_pose = sapien.Pose([*CENTRE, half])
+            builder.initial_pose = Pose.create(sapien.Pose([*CENTRE, half]))
             cube = builder.build(f"cube-{i}")
             self.remove_from_state_dict_registry(cube)
             cubes.append(cube)

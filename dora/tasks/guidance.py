@@ -9,6 +9,7 @@ so that a = 0 executes the candidate and the policy only has to learn what the c
 low-pass keeps exploration noise from shaking the fingers; c is part of the observation.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -179,7 +180,7 @@ class GraspReference:
             hand,
         )
 
-    def corrected(self, target: Target, action: Float[Tensor, "n a"], expand) -> Target:
+    def corrected(self, target: Target, action: Float[Tensor, "n a"], expand: Callable[[Tensor], Tensor]) -> Target:
         """The reference plus the low-passed, bounded correction; stores both for the next step.
 
         `expand` maps the action's hand part to (n, 20).

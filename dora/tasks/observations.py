@@ -71,6 +71,7 @@ OBSERVATIONS: dict[str, Entry] = {
     "object_w": Entry(lambda s: turned_in_wrist(s, s.object_w), "rad/s", "object spin in the hand's axes"),
     "object_rise": Entry(lambda s: lifted(s)[:, None], "m", "height of the object above its start"),
     "touch": Entry(lambda s: s.touch.float(), "1", "contact of thumb, index, middle, ring, pinky, palm"),
+    "deepest": Entry(lambda s: s.deepest[:, None] * 1000, "mm", "deepest penetration of the episode so far"),
     "stage": Entry(lambda s: s.stage[:, None].float(), "1", "index of the active stage"),
     "time": Entry(lambda s: s.time[:, None], "1", "share of the episode that is over"),
     "goal": Entry(

@@ -37,7 +37,6 @@ class TaskOptions:
 
     guided: bool
     preset: Preset
-    num_envs: int
     robot: str
     control_mode: str
     sim_backend: str
@@ -88,6 +87,4 @@ def check_options(
         sim_backend = "physx_cpu_batch" if num_envs > 1 else "physx_cpu"
     if render_backend == "auto":
         render_backend = choose_render_backend(render_mode, obs_mode)
-    return TaskOptions(
-        guidance == "affordance", find_preset(preset), num_envs, robot_uids, mode, sim_backend, render_backend
-    )
+    return TaskOptions(guidance == "affordance", find_preset(preset), robot_uids, mode, sim_backend, render_backend)

@@ -2,7 +2,7 @@
 
 import sapien
 from mani_skill.envs.scene import ManiSkillScene
-from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs import Actor, Pose
 
 TABLE_CENTRE = (0.35, 0.0)
 """Centre of the table top in the robot's base frame [m]."""
@@ -24,12 +24,12 @@ def add_table(scene: ManiSkillScene) -> Actor:
     x, y = TABLE_CENTRE
     top = sapien.Pose([x, y, -TABLE_HALF[2]])
     builder = scene.create_actor_builder()
-    builder.add_box_collision(top, list(TABLE_HALF))
+    builder.add_box_collision(top, TABLE_HALF)
     if scene.can_render():
         wood, steel, floor = (
             sapien.render.RenderMaterial(base_color=list(c), roughness=0.7, specular=0.3) for c in (WOOD, STEEL, FLOOR)
         )
-        builder.add_box_visual(top, list(TABLE_HALF), wood)
+        builder.add_box_visual(top, TABLE_HALF, wood)
         half = TABLE_HEIGHT / 2 - TABLE_HALF[2]
         for sx in (-1, 1):
             for sy in (-1, 1):
@@ -38,7 +38,7 @@ def add_table(scene: ManiSkillScene) -> Actor:
                     y + sy * (TABLE_HALF[1] - 2 * LEG_HALF),
                     -2 * TABLE_HALF[2] - half,
                 ]
-                builder.add_box_visual(sapien.Pose(foot), [LEG_HALF, LEG_HALF, half], steel)
-        builder.add_box_visual(sapien.Pose([x, y, -TABLE_HEIGHT - 0.01]), [FLOOR_HALF, FLOOR_HALF, 0.01], floor)
-    builder.initial_pose = sapien.Pose()
+                builder.add_box_visual(sapien.Pose(foot), (LEG_HALF, LEG_HALF, half), steel)
+        builder.add_box_visual(sapien.Pose([x, y, -TABLE_HEIGHT - 0.01]), (FLOOR_HALF, FLOOR_HALF, 0.01), floor)
+    builder.initial_pose = Pose.create(sapien.Pose())
     return builder.build_static("table")

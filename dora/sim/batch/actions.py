@@ -16,8 +16,7 @@ def check_action(env: Any, action: Any) -> None:
     Args:
         env: an unwrapped ManiSkill environment on `physx_cpu_batch`.
         action: None, an array (environments, dimension), or a dictionary of those by robot, or a dictionary
-        with
-            ``control_mode`` and ``action``. One environment may leave the batch axis out.
+            with ``control_mode`` and ``action``. One environment may leave the batch axis out.
 
     Raises:
         InputError: if a shape or a robot's name does not fit or a number is not finite.

@@ -126,8 +126,7 @@ def _set_pose(setter: Callable[[sapien.Pose], None], pose: Any) -> None:
 
 
 def _velocity_setter(row: BodyRow, kind: str) -> Setter | None:
-    """Setter of a velocity; None for kinematic bodies and links other than roots, which have none of their
-    own."""
+    """Setter of a velocity; None for kinematic bodies and links other than roots, which have none of their own."""
     if not row.is_link:
         return None if row.body.kinematic else getattr(row.body, f"set_{kind}_velocity")
     return getattr(row.body.articulation, f"set_root_{kind}_velocity") if row.body.is_root else None

@@ -11,8 +11,7 @@ from sapien import physx
 from dora.sim.batch.packed import POSE_FLOATS, POSE_ORDER, RIGID_FLOATS, PackedSource
 
 BODY_COLUMNS = 13
-"""Columns of a body's row: position [m], quaternion wxyz, linear [m/s] and angular [rad/s] velocity; world
-frame."""
+"""Columns of a body's row: position [m], quaternion wxyz, linear [m/s] and angular [rad/s] velocity; world frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +77,7 @@ def pose_index(layout: Layout, scenes: list[sapien.Scene], poses: PackedSource) 
 class StateIndex:
     """Index into ``state.flat()``; entries without a value point at its padding zero.
 
-    ``velocity`` (actor bodies, 6); ``qpos``, ``qvel``, ``target_qpos``, ``target_qvel`` (articulations, max
-    dof).
+    ``velocity`` (actor bodies, 6); ``qpos``, ``qvel``, ``target_qpos``, ``target_qvel`` (articulations, max dof).
     """
 
     velocity: np.ndarray

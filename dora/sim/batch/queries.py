@@ -10,8 +10,7 @@ BodyPair = tuple[Any, Any]
 
 
 class _Impulses:
-    """Result of a query; ``torch()`` is a float32 tensor (rows, 3) in N s, as of the last time it was
-    asked."""
+    """Result of a query; ``torch()`` is a float32 tensor (rows, 3) in N s, as of the last time it was asked."""
 
     def __init__(self, rows: int):
         self._values = torch.zeros(rows, 3)

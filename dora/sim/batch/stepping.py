@@ -141,8 +141,7 @@ class Stepper:
             self.resized()
 
     def refresh_targets(self) -> None:
-        """`refresh` for drive targets. Writing targets leaves all other values of the packed state as they
-        were."""
+        """`refresh` for drive targets. Writing targets leaves all other values of the packed state as they were."""
         if self._targets_stale:
             self.flush()
             self.state.invalidate_all()
@@ -166,8 +165,7 @@ class Stepper:
         self.state.invalidate(environments)
 
     def set_targets(self, setters: Setters, numbers: np.ndarray, values: np.ndarray, environments: np.ndarray) -> None:
-        """Call ``setters[numbers[k]](values[k])`` for environment ``environments[k]``, now or before its
-        next step."""
+        """Call ``setters[numbers[k]](values[k])`` for environment ``environments[k]``, now or before its next step."""
         self._targets.add(setters, numbers, values, environments)
         self._targets_stale = True
         if not self._limit:
@@ -175,8 +173,7 @@ class Stepper:
 
     @contextmanager
     def writing(self, environments: Sequence[int]) -> Iterator[None]:
-        """Around a direct change of some environments: does what waits before it, and declares them changed
-        after it."""
+        """Around a direct change of some environments: does what waits before, and declares them changed after."""
         self.flush()
         if self.profile:
             self.profile.mark()

@@ -13,8 +13,7 @@ from torch import Tensor
 from dora.sim.batch.packed import Source
 
 _PLANS_KEPT = 1024
-"""Reading plans remembered per table. ManiSkill's structs index with the same tensors for ever, so few are
-needed."""
+"""Reading plans remembered per table; few are needed: ManiSkill's structs index with the same tensors for ever."""
 
 
 @dataclass(frozen=True, eq=False)

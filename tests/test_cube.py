@@ -1,0 +1,138 @@
+"""DoraCube-v1: its geometry on invented states, and what its scripted grasp is worth."""
+
+from dataclasses import fields
+from math import pi, sin
+
+import pytest
+import torch
+from torch import Tensor
+
+import dora.tasks as tasks
+from dora.tasks import cube
+from dora.tasks.snapshot import Snapshot, derived
+
+STARTS = 100
+"""Random starts of the scripted grasp."""
+DEEPEST_MM = 2.0
+"""Largest penetration of a clean scripted grasp [mm]."""
+STILL = 0.002
+"""Speed of a cube that is held still, by finite differences [m/s]."""
+SHAKE_STEPS = 48
+SHAKE_PERIOD = 8
+"""Period of the shake [control steps]."""
+
+SIZES = {
+    "arm_q": 7, "hand_q": 20, "hand_v": 20, "hand_target": 20, "wrist_q": 4, "object_q": 4, "goal_q": 4,
+    "touch": 6, "force": 6, "action": 26, "previous_action": 26, "correction": 26,
+    "goal_pregrasp": 20, "goal_grasp": 20,
+}  # fmt: skip
+SCALARS = ("supported", "penetration", "deepest", "stage", "time", "phase")
+
+
+def invented(n: int, **given: Tensor) -> Snapshot:
+    """A snapshot of zeros, unit quaternions and 3 cm cubes, with what is given."""
+    values: dict[str, Tensor] = {}
+    for f in fields(Snapshot):
+        shape = (n,) if f.name in SCALARS else (n, SIZES.get(f.name, 3))
+        values[f.name] = torch.zeros(shape)
+        if f.name.endswith("_q") and SIZES.get(f.name) == 4:
+            values[f.name][:, 0] = 1.0
+    values |= {"tip_p": torch.zeros(n, 5, 3), "tip_q": torch.tensor([1.0, 0, 0, 0]).repeat(n, 5, 1)}
+    values |= {k: values[k].bool() for k in ("touch", "supported")} | {k: values[k].long() for k in ("stage", "phase")}
+    values["object_half"] = torch.full((n, 3), cube.HALF)
+    return Snapshot(**(values | given))
+
+
+def test_surface_distance_is_that_of_a_box():
+    tips = torch.zeros(1, 5, 3)
+    tips[0, :, 0] = torch.tensor([0.0, 0.02, 0.03, 0.08, 0.03])
+    tips[0, 4, 1] = 0.07  # diagonal: 4 cm beside an edge
+    expected = torch.tensor([[-0.03, -0.01, 0.0, 0.05, 0.04]]) - cube.TIP_RADIUS
+    torch.testing.assert_close(cube.surface_distance(invented(1, tip_p=tips)), expected)
+
+
+def test_lifting_pays_until_the_target_height_and_more_with_an_opposed_grasp():
+    rise = torch.tensor([0.0, 0.05, 0.10, 0.40])
+    p = torch.zeros(4, 3)
+    p[:, 2] = rise
+    touch = torch.zeros(4, 6, dtype=torch.bool)
+    loose = cube.TERMS.terms["lift"].value(invented(4, object_p=p))
+    touch[:, :2] = True
+    firm = cube.TERMS.terms["lift"].value(invented(4, object_p=p, touch=touch))
+    torch.testing.assert_close(firm, torch.tensor([0.0, 0.5, 1.0, 1.0]))
+    assert (firm[1:] > loose[1:]).all()
+
+
+def test_penetration_costs_more_the_deeper_it_is():
+    depth = torch.tensor([0.0, 0.0005, 0.002, 0.1])
+    cost = cube.TERMS.terms["penetration"].value(invented(4, penetration=depth))
+    assert cost[0] == cost[1] == 0
+    assert 0 < cost[2] < cost[3] == 1
+
+
+def test_every_term_stays_in_bounds_on_random_states():
+    torch.manual_seed(0)
+    n = 256
+    s = invented(
+        n,
+        tip_p=torch.randn(n, 5, 3), object_p=torch.randn(n, 3), wrist_p=torch.randn(n, 3), goal_p=torch.randn(n, 3),
+        touch=torch.rand(n, 6) > 0.5, action=3 * torch.randn(n, 26), penetration=torch.rand(n) * 0.05,
+        stage=torch.randint(0, 4, (n,)),
+    )  # fmt: skip
+    for terms in (cube.TERMS, cube.PAPER_TERMS):
+        for name, term in terms.terms.items():
+            value = term.value(s)
+            assert ((value >= 0) & (value <= 1)).all(), name
+
+
+def test_derived_quantities_are_computed_once():
+    calls = []
+
+    @derived
+    def count(s: Snapshot) -> Tensor:
+        calls.append(1)
+        return s.time
+
+    s = invented(2)
+    assert count(s) is count(s)
+    assert len(calls) == 1
+
+
+@pytest.fixture(scope="module")
+def held() -> tasks.DoraEnv:
+    """A batch after its scripted episode, with the history of the cube in the last half second."""
+    task = tasks.make_task("DoraCube-v1", STARTS, preset="none")
+    task.reset(seed=0)
+    history = []
+    for t in range(task.max_steps):
+        task.step(task.scripted_action())
+        if t >= task.max_steps - 10:
+            history.append(task.snapshot.object_p)
+    task.history = torch.stack(history)  # type: ignore[attr-defined]
+    return task
+
+
+def test_the_script_lifts_and_holds_from_random_starts(held: tasks.DoraEnv):
+    info = held.evaluate()
+    clean = info["success"] & (info["penetration_max_mm"] <= DEEPEST_MM)
+    speed = (held.history.diff(dim=0) * held.CONTROL_FREQUENCY).norm(dim=-1).amax(0)  # type: ignore[attr-defined]
+    still = speed <= STILL
+    print(f"clean {clean.float().mean():.2f}, still {still.float().mean():.2f}, fastest {speed.max() * 1000:.2f} mm/s,")
+    print(f"deepest {info['penetration_max_mm'].max():.2f} mm")
+    assert (clean & still).float().mean() >= 0.95
+
+
+def test_the_cube_survives_a_shake(held: tasks.DoraEnv):
+    ready = held.evaluate()["success"]
+    action = torch.zeros(STARTS, held.action_size)
+    lowest = torch.full((STARTS,), torch.inf)
+    path = []
+    for t in range(SHAKE_STEPS):
+        action[:, :3] = sin(2 * pi * t / SHAKE_PERIOD)
+        held.step(action)
+        lowest = torch.minimum(lowest, held.snapshot.object_p[:, 2] - held.snapshot.start_p[:, 2])
+        path.append(held.snapshot.wrist_p)
+    travel = torch.stack(path).std(0).norm(dim=-1)
+    print(f"wrist moved {travel.mean() * 1000:.1f} mm rms; held {(lowest > 0.08).float().mean():.2f}")
+    assert travel.min() > 0.003  # it was a shake
+    assert (lowest[ready] > 0.08).float().mean() >= 0.95
