@@ -1,0 +1,145 @@
+"""Tables and curves from finished runs: everything a README may claim, made from files."""
+
+import csv
+import html
+import json
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean, stdev
+
+from dora.agents.files import write_bytes
+from dora.errors import InputError
+
+COLOURS = {
+    ("ppo", "affordance"): "#c0392b",
+    ("ppo", "none"): "#e59866",
+    ("sac", "affordance"): "#1f618d",
+    ("sac", "none"): "#85c1e9",
+}
+"""Line colour of each learner with and without guidance; others take matplotlib's."""
+CURVE_COLUMNS = ("env_steps", "wall_seconds", "success_rate", "return_mean", "penetration_p95_mm")
+SECONDS_PER_MINUTE = 60.0
+
+Group = tuple[str, str, str]
+"""Environment, agent, guidance."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One finished run: its `result.json` and the rows of its `curve.csv`."""
+
+    folder: Path
+    result: dict
+    curve: list[dict[str, float]]
+
+    @property
+    def group(self) -> Group:
+        """Environment, agent and guidance: runs that differ only in their seed share it."""
+        return self.result["env"], self.result["agent"], self.result["guidance"]
+
+
+def find_runs(root: Path) -> list[Run]:
+    """All finished runs under `root`, by path; unfinished ones are left out.
+
+    Raises:
+        InputError: if there is none, or a result file is damaged.
+    """
+    runs = []
+    for path in sorted(root.rglob("result.json")):
+        try:
+            result = json.loads(path.read_text())
+        except json.JSONDecodeError as error:
+            raise InputError(f"{path} is damaged ({error}); repeat the run or remove its folder.") from error
+        curve = path.with_name("curve.csv")
+        if result.get("finished"):
+            runs.append(Run(path.parent, result, _rows(curve) if curve.exists() else []))
+    if not runs:
+        raise InputError(f"there is no finished run under {root}: point at a folder with result.json files in it.")
+    return runs
+
+
+def _rows(path: Path) -> list[dict[str, float]]:
+    with path.open() as file:
+        return [{k: float(row[k]) for k in CURVE_COLUMNS} for row in csv.DictReader(file)]
+
+
+def _spread(values: list[float], digits: int = 1) -> str:
+    deviation = f" ± {stdev(values):.{digits}f}" if len(values) > 1 else ""
+    return f"{mean(values):.{digits}f}{deviation}"
+
+
+def tables(runs: list[Run]) -> str:
+    """Markdown: one row per environment, learner and guidance; mean and deviation over seeds."""
+    groups: dict[Group, list[dict]] = defaultdict(list)
+    for run in runs:
+        groups[run.group].append(run.result)
+    head = "| task | agent | guidance | seeds | success % | zero correction % | penetration p95 mm | steps | minutes |"
+    lines = [head, "|" + " --- |" * 9]
+    for (env, agent, guidance), results in sorted(groups.items()):
+        zero = [100 * r["zero_success_rate"] for r in results if r["zero_success_rate"] is not None]
+        cells = [
+            env, agent.upper(), guidance, str(len(results)),
+            f"**{_spread([100 * r['success_rate'] for r in results])}**",
+            _spread(zero) if zero else "-",
+            _spread([r["penetration_p95_mm"] for r in results]),
+            f"{mean(r['env_steps'] for r in results) / 1000:.0f}k",
+            _spread([r["wall_seconds"] / SECONDS_PER_MINUTE for r in results]),
+        ]  # fmt: skip
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def draw_curves(runs: list[Run], env: str, path: Path) -> None:
+    """Success and return over environment steps and minutes, one line per learner: mean and range over seeds."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    groups: dict[Group, list[Run]] = defaultdict(list)
+    for run in runs:
+        if run.result["env"] == env and run.curve:
+            groups[run.group].append(run)
+    figure, axes = pyplot.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
+    steps, minutes = ("env_steps", 1e3), ("wall_seconds", SECONDS_PER_MINUTE)
+    views = ((*steps, "success_rate"), (*minutes, "success_rate"), (*steps, "return_mean"))
+    for axis, (x, unit, y) in zip(axes, views, strict=True):
+        for (_, agent, guidance), members in sorted(groups.items()):
+            length = min(len(m.curve) for m in members)
+            values = [[m.curve[i][y] for m in members] for i in range(length)]
+            at = [mean(m.curve[i][x] for m in members) / unit for i in range(length)]
+            colour = COLOURS.get((agent, guidance))
+            label = f"{agent.upper()}, guidance {guidance} ({len(members)})"
+            axis.plot(at, [mean(v) for v in values], color=colour, marker="o", markersize=3, label=label)
+            axis.fill_between(at, [min(v) for v in values], [max(v) for v in values], color=colour, alpha=0.15)
+        axis.set_xlabel("environment steps [1000]" if x == "env_steps" else "minutes")
+        axis.set_ylabel(y.replace("_", " "))
+        axis.grid(alpha=0.3)
+    axes[0].set_ylim(-0.02, 1.02)
+    axes[1].set_ylim(-0.02, 1.02)
+    axes[0].legend(fontsize=8, loc="lower right")
+    figure.suptitle(f"{env}: greedy evaluation during training (mean and range over seeds)")
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def write_report(root: Path, out: Path) -> list[Path]:
+    """Writes `tables.md`, one figure per environment and `report.html` into `out`; returns their paths."""
+    runs = find_runs(root)
+    out.mkdir(parents=True, exist_ok=True)
+    text = tables(runs)
+    write_bytes(out / "tables.md", text.encode())
+    figures = []
+    for env in sorted({run.result["env"] for run in runs}):
+        path = out / f"{env}.png"
+        draw_curves(runs, env, path)
+        figures.append(path)
+    pictures = "".join(f'<p><img src="{html.escape(p.name)}" style="max-width:100%"></p>' for p in figures)
+    rows = [line.strip("|").split("|") for line in text.splitlines() if not line.startswith("| ---")]
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(c.strip(' *'))}</td>" for c in row) + "</tr>" for row in rows)
+    style = "body{font-family:sans-serif;margin:2em}td{padding:.2em .8em;border-bottom:1px solid #ccc}"
+    page = f"<!doctype html><meta charset=utf-8><title>Dora runs</title><style>{style}</style>"
+    page += f"<h1>Runs in {html.escape(root.name)}</h1><table>{body}</table>{pictures}"
+    write_bytes(out / "report.html", page.encode())
+    return [out / "tables.md", out / "report.html", *figures]
