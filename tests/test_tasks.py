@@ -246,6 +246,8 @@ def test_joint_control_modes(mode: str, joints: int):
     assert task.action_size == 7 + joints
     obs = task.step(actions(task, 1, scale=0.1)[0])[0]
     assert torch.isfinite(obs).all()
+    with pytest.raises(InputError, match="commands no wrist"):
+        _ = task.agent.wrist_controller
     task.close()
 
 

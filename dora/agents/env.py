@@ -22,13 +22,40 @@ class Task(Protocol):
     Success does not end an episode: it runs to `max_steps` unless it fails.
     """
 
-    num_envs: int
-    device: torch.device
-    single_action_space: Any  # a gymnasium Box in [-1, 1]
-    elapsed_steps: Int[Tensor, " n"]
-    max_steps: int
-    logged: tuple[str, ...]
-    stage_names: tuple[str, ...]
+    @property
+    def num_envs(self) -> int:
+        """Number of environments N."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        ...
+
+    @property
+    def single_action_space(self) -> Any:
+        """A gymnasium Box in [-1, 1]."""
+        ...
+
+    @property
+    def elapsed_steps(self) -> Int[Tensor, " n"]:
+        """Control steps since the start of each episode."""
+        ...
+
+    @property
+    def max_steps(self) -> int:
+        """Control steps of an episode that does not fail."""
+        ...
+
+    @property
+    def logged(self) -> tuple[str, ...]:
+        """Names in the info whose (N,) values are worth a curve."""
+        ...
+
+    @property
+    def stage_names(self) -> tuple[str, ...]:
+        """Names of the sub-tasks, in order."""
+        ...
 
     def reset(
         self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
