@@ -127,7 +127,7 @@ class DoraEnv(JudgedEnv):
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
-        pose = sapien_utils.look_at(eye=[1.15, -0.75, 0.65], target=[0.45, 0.0, 0.22])
+        pose = sapien_utils.look_at(eye=[1.05, 0.62, 0.48], target=[0.42, 0.02, 0.2])
         return CameraConfig("render_camera", pose, width=640, height=640, fov=0.8, near=0.01, far=10)
 
     def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:

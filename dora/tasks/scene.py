@@ -15,19 +15,21 @@ LEG_HALF = 0.03
 WOOD = (0.55, 0.42, 0.30, 1.0)
 STEEL = (0.25, 0.26, 0.28, 1.0)
 FLOOR = (0.75, 0.76, 0.78, 1.0)
-FLOOR_HALF = 6.0
-"""Half width of the visible floor [m]."""
+WALL = (0.86, 0.88, 0.90, 1.0)
+ROOM_HALF = 3.0
+"""Half width of the room that is only drawn [m]."""
 
 
 def add_table(scene: ManiSkillScene) -> Actor:
-    """A static table whose upper face is z = 0, with legs and a floor that are only drawn."""
+    """A static table whose upper face is z = 0, with legs and a room that are only drawn."""
     x, y = TABLE_CENTRE
     top = sapien.Pose([x, y, -TABLE_HALF[2]])
     builder = scene.create_actor_builder()
     builder.add_box_collision(top, TABLE_HALF)
     if scene.can_render():
-        wood, steel, floor = (
-            sapien.render.RenderMaterial(base_color=list(c), roughness=0.7, specular=0.3) for c in (WOOD, STEEL, FLOOR)
+        wood, steel, floor, wall = (
+            sapien.render.RenderMaterial(base_color=list(c), roughness=0.7, specular=0.3)
+            for c in (WOOD, STEEL, FLOOR, WALL)
         )
         builder.add_box_visual(top, TABLE_HALF, wood)
         half = TABLE_HEIGHT / 2 - TABLE_HALF[2]
@@ -39,6 +41,10 @@ def add_table(scene: ManiSkillScene) -> Actor:
                     -2 * TABLE_HALF[2] - half,
                 ]
                 builder.add_box_visual(sapien.Pose(foot), (LEG_HALF, LEG_HALF, half), steel)
-        builder.add_box_visual(sapien.Pose([x, y, -TABLE_HEIGHT - 0.01]), (FLOOR_HALF, FLOOR_HALF, 0.01), floor)
+        builder.add_box_visual(sapien.Pose([x, y, -TABLE_HEIGHT - 0.01]), [ROOM_HALF, ROOM_HALF, 0.01], floor)
+        for side in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            centre = [x + side[0] * ROOM_HALF, y + side[1] * ROOM_HALF, ROOM_HALF - TABLE_HEIGHT]
+            thin = [0.01 if s else ROOM_HALF for s in side]
+            builder.add_box_visual(sapien.Pose(centre), [*thin, ROOM_HALF], wall)
     builder.initial_pose = Pose.create(sapien.Pose())
     return builder.build_static("table")
