@@ -9,9 +9,10 @@ from dora.errors import InputError
 
 PRESETS: dict[tuple[str, str], dict[str, Any]] = {
     ("DoraCube-v1", "ppo"): {
-        "total_steps": 200_000,
+        "total_steps": 300_000,
+        "stop_success": 0.99,
         "num_envs": 64,
-        "eval_every": 50_000,
+        "eval_every": 40_000,
         "eval_episodes": 50,
         "eval_envs": 50,
         "learner": {"rollout": 16, "log_std": -1.0},
