@@ -18,11 +18,13 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
         "learner": {"rollout": 16, "log_std": -1.0},
     },
     ("DoraCube-v1", "sac"): {
-        "total_steps": 150_000,
+        "total_steps": 200_000,
+        "stop_success": 0.99,
         "num_envs": 32,
-        "eval_every": 50_000,
+        "eval_every": 25_000,
         "eval_episodes": 50,
         "eval_envs": 50,
+        "learner": {"log_std": -1.2, "target_entropy": -1.0, "learning_rate": 3e-4},
     },
 }
 """Differences from the defaults of `RunConfig`, and under `learner` from those of the learner."""
