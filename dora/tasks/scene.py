@@ -41,10 +41,10 @@ def add_table(scene: ManiSkillScene) -> Actor:
                     -2 * TABLE_HALF[2] - half,
                 ]
                 builder.add_box_visual(sapien.Pose(foot), (LEG_HALF, LEG_HALF, half), steel)
-        builder.add_box_visual(sapien.Pose([x, y, -TABLE_HEIGHT - 0.01]), [ROOM_HALF, ROOM_HALF, 0.01], floor)
-        for side in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            centre = [x + side[0] * ROOM_HALF, y + side[1] * ROOM_HALF, ROOM_HALF - TABLE_HEIGHT]
-            thin = [0.01 if s else ROOM_HALF for s in side]
-            builder.add_box_visual(sapien.Pose(centre), [*thin, ROOM_HALF], wall)
+        builder.add_box_visual(sapien.Pose([x, y, -TABLE_HEIGHT - 0.01]), (ROOM_HALF, ROOM_HALF, 0.01), floor)
+        for sx, sy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            centre = [x + sx * ROOM_HALF, y + sy * ROOM_HALF, ROOM_HALF - TABLE_HEIGHT]
+            half = (0.01 if sx else ROOM_HALF, 0.01 if sy else ROOM_HALF, ROOM_HALF)
+            builder.add_box_visual(sapien.Pose(centre), half, wall)
     builder.initial_pose = Pose.create(sapien.Pose())
     return builder.build_static("table")
