@@ -15,7 +15,7 @@ app = tyro.extras.SubcommandApp()
 @app.command(name="env")
 def bench_env(
     env: str = "PickCube-v1",
-    num_envs: int = 64,
+    num_envs: int = 256,
     workers: int = benchmark.all_cores(),
     seconds: float = 10.0,
     json: bool = False,
