@@ -87,6 +87,7 @@ class _Reader:
         return InputError(f"{self.path}: {text}")
 
     def robot(self, content: Table) -> RobotDescription:
+        """The whole description; InputError about the first thing that does not fit."""
         self.keys(content, "robot.toml", "the file")
         arm, hand = self.group(content["arm"], "arm"), self.group(content["hand"], "hand")
         twice = set(arm.names) & set(hand.names)
@@ -111,6 +112,7 @@ class _Reader:
         )
 
     def keys(self, table: Any, kind: str, where: str) -> None:
+        """Refuses unknown and missing keys of a table."""
         if not isinstance(table, dict):
             raise self.fail(f"{where} must be a table.")
         required, optional = KEYS[kind]
@@ -147,6 +149,7 @@ class _Reader:
         return tuple(names)
 
     def group(self, table: Table, name: str) -> JointGroup:
+        """A joint group with limits from the URDF [rad, rad/s, N m] and gains from the table."""
         self.keys(table, "joint group", name)
         names = self.names(table["joints"], f"{name}.joints")
         for joint in names:
@@ -169,6 +172,7 @@ class _Reader:
         return JointGroup(names=names, **limits, **gains)
 
     def couplings(self, rows: Sequence[Table], hand: JointGroup) -> tuple[Coupling, ...]:
+        """All couplings of the hand; InputError if a joint follows twice or leads while following."""
         found = tuple(self.coupling(row, hand) for row in rows)
         followers = [coupling.follower for coupling in found]
         for coupling in found:
@@ -180,6 +184,7 @@ class _Reader:
         return found
 
     def coupling(self, table: Table, hand: JointGroup) -> Coupling:
+        """One coupling, its joints as indices into the hand group."""
         self.keys(table, "coupling", "a coupling")
         for key in ("follower", "leader"):
             if table[key] not in hand.names:
@@ -189,6 +194,7 @@ class _Reader:
         return Coupling(follower, leader, *factors.tolist())
 
     def finger(self, name: str, table: Table, hand: JointGroup) -> Finger:
+        """One finger; `pad` is a point (3,) in its distal link's frame [m]."""
         self.keys(table, "finger", f"fingers.{name}")
         joints = self.names(table["joints"], f"fingers.{name}.joints")
         for joint in joints:
@@ -198,6 +204,7 @@ class _Reader:
         return Finger(name, joints, **links, pad=self.numbers(table["pad"], 3, f"fingers.{name}.pad"))
 
     def posture(self, name: str, table: Table, arm: JointGroup, hand: JointGroup) -> Posture:
+        """A named posture (n_arm,), (n_hand,) [rad] within the joint limits."""
         self.keys(table, "posture", f"postures.{name}")
         angles = {}
         for key, group in (("arm", arm), ("hand", hand)):
@@ -209,6 +216,7 @@ class _Reader:
         return Posture(**angles)
 
     def contacts(self, groups: dict[str, Table], shapes: Iterable[str]) -> dict[str, Contact]:
+        """Contact settings by link; InputError if a link with shapes has none or two."""
         found: dict[str, Contact] = {}
         for name, table in groups.items():
             self.keys(table, "contact group", f"contact.{name}")

@@ -231,6 +231,7 @@ class CubeEnv(DoraEnv):
         return hand_made_candidates()
 
     def load_object(self, scale: np.ndarray) -> Actor:
+        """One cube per sub-scene, each with its own size and material, merged into one actor."""
         halves = HALF * scale
         cubes = []
         for i, half in enumerate(halves.tolist()):
