@@ -80,6 +80,7 @@ def runs_batched(env: Any) -> bool:
 
 def _parse_backends(original: Callable) -> Callable:
     def parse(sim_backend: str, render_backend: str | None) -> BackendInfo:
+        """Stock's answer, or that for a CPU under our name."""
         if sim_backend != BACKEND:
             return original(sim_backend, render_backend)
         info = original("physx_cpu", render_backend or "none")
@@ -105,6 +106,7 @@ def _init(original: Callable) -> Callable:
 
 def _setup_scene(original: Callable) -> Callable:
     def setup_scene(self: BaseEnv) -> None:
+        """Stock's scene, or a `BatchScene`; InputError if pictures are asked for and there is no driver."""
         if not runs_batched(self):
             return original(self)
         renderers = [] if self._render_device is None else [self._render_device]
@@ -128,6 +130,7 @@ def _setup_scene(original: Callable) -> Callable:
 
 def _step_action(original: Callable) -> Callable:
     def step_action(self: BaseEnv, action: Any) -> Any:
+        """Checks the action, then lets the control step's physics wait for one pass per environment."""
         if not runs_batched(self):
             return original(self, action)
         check_action(self, action)
@@ -155,6 +158,7 @@ def _get_meshes(original: Callable) -> Callable:
     """Tell ManiSkill that poses can be read, which it doubts until a GPU was initialised."""
 
     def get_meshes(self: Articulation, *args: Any, **kwargs: Any) -> Any:
+        """Stock's meshes, while the scene says that it has been initialised."""
         if not isinstance(self.scene, BatchScene):
             return original(self, *args, **kwargs)
         self.scene._gpu_sim_initialized = True
@@ -174,6 +178,7 @@ def _set_pose_action(original: Callable) -> Callable:
     """
 
     def set_action(self: PDEEPosController, action: Any) -> None:
+        """Stock's action relative to the measured pose, as on a single CPU."""
         if not isinstance(self.scene, BatchScene) or self.config.use_target:
             return original(self, action)
         self._target_pose = self.ee_pose_at_base
