@@ -14,9 +14,9 @@ from tensordict import TensorDict
 from dora.agents import replay as replay_module
 from dora.agents.checkpoint import Checkpoint, check_belongs, read_checkpoint
 from dora.agents.config import RunConfig
-from dora.agents.files import write_bytes
 from dora.agents.replay import Replay
 from dora.errors import InputError
+from dora.files import write_bytes
 
 CONFIG = RunConfig("Fake-v1", "ppo", "none")
 

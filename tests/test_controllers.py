@@ -10,7 +10,7 @@ import dora.tasks as tasks
 from dora.robot.rotations import quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
 from dora.sim.controllers import LIMIT_MARGIN
 from dora.tasks.base import DoraEnv
-from dora.tasks.guidance import wrist_step
+from dora.tasks.correction import wrist_step
 
 PATH_STEPS = 60
 PATH_RADIUS = 0.06

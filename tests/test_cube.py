@@ -24,9 +24,9 @@ SHAKE_PERIOD = 8
 SIZES = {
     "arm_q": 7, "hand_q": 20, "hand_v": 20, "hand_target": 20, "wrist_q": 4, "object_q": 4, "goal_q": 4,
     "touch": 6, "force": 6, "action": 26, "previous_action": 26, "correction": 26,
-    "goal_pregrasp": 20, "goal_grasp": 20,
+    "goal_pregrasp": 20, "goal_grasp": 20, "phase": 4, "contact_finger": 0,
 }  # fmt: skip
-SCALARS = ("supported", "penetration", "deepest", "stage", "time", "phase")
+SCALARS = ("supported", "penetration", "deepest", "stage", "time")
 
 
 def invented(n: int, **given: Tensor) -> Snapshot:
@@ -38,7 +38,9 @@ def invented(n: int, **given: Tensor) -> Snapshot:
         if f.name.endswith("_q") and SIZES.get(f.name) == 4:
             values[f.name][:, 0] = 1.0
     values |= {"tip_p": torch.zeros(n, 5, 3), "tip_q": torch.tensor([1.0, 0, 0, 0]).repeat(n, 5, 1)}
-    values |= {k: values[k].bool() for k in ("touch", "supported")} | {k: values[k].long() for k in ("stage", "phase")}
+    values |= {"near_p": torch.zeros(n, 3, 3), "near_q": values["tip_q"][:, :3], "contact_p": torch.zeros(n, 0, 3)}
+    values |= {k: values[k].bool() for k in ("touch", "supported")}
+    values |= {k: values[k].long() for k in ("stage", "contact_finger")}
     values["object_half"] = torch.full((n, 3), cube.HALF)
     return Snapshot(**(values | given))
 

@@ -99,12 +99,12 @@ def test_evaluate_changes_nothing(batch: DoraEnv):
     batch.reset(seed=0)
     for a in actions(batch, 5):
         batch.step(a)
-    state = {k: v.clone() for k, v in batch.machine.get_state().items()} | batch.reference.get_state()
+    state = batch.machine.get_state() | batch.guide.get_state()
     first = batch.evaluate()
     for _ in range(5):
         again = batch.evaluate()
     assert all(torch.equal(first[k], again[k]) for k in first)
-    now = batch.machine.get_state() | batch.reference.get_state()
+    now = batch.machine.get_state() | batch.guide.get_state()
     assert all(torch.equal(state[k], now[k]) for k in state)
 
 

@@ -1,15 +1,32 @@
 """Grasp candidates of one object: where the wrist goes, how the fingers close, which part is held."""
 
-from dataclasses import dataclass
+from __future__ import annotations
 
+import hashlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
+from dora.files import read_tensors, write_tensors
+from dora.robot import RobotDescription
+
+FORMAT = "dora-grasps 1"
+"""Format and version of a file of candidates."""
+UNKNOWN = torch.empty(0)
+"""Stands for a tensor field that is not given; replaced when the candidates are made."""
+DIGITS = 9
+"""Decimals of lengths [m] and angles [rad] that count in a digest."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GraspCandidates:
     """C grasps of one object, all poses in the object frame.
 
@@ -21,6 +38,21 @@ class GraspCandidates:
         pregrasp: (c, 20) hand joints before closing [rad].
         grasp: (c, 20) commanded hand joints of the closed hand [rad]; beyond contact, so that they squeeze.
         grasp_class: c names such as "BodyGrasp" or "HandleGrasp".
+        joints: (c, 20) hand joints at contact [rad]; `grasp` if not given.
+        contacts: (c, k, 3) contact points on the object [m]; k = 0 if not given.
+        contact_finger: (c, k) what touches there: 0 nothing, 1 palm, 2 thumb, ... 6 pinky.
+        energy: (c,) per name of an energy term, unweighted.
+        penetration: (c,) deepest overlap of hand and object at `joints` [m]; nan = not measured.
+        self_penetration: (c,) deepest overlap of the hand with itself at `joints` [m]; nan = not measured.
+        valid: (c,) whether the grasp passed its validation; true if not given.
+        score: (c,) share of executed lifts that succeeded; nan = not ranked.
+        digest: digest of the object's geometry and labels; "" = unknown.
+        robot: name of the robot; "" = unknown.
+        robot_digest: `hand_digest` of the robot; "" = unknown.
+        settings: how the candidates were made, as text.
+
+    Raises:
+        InputError: no candidate, fields of different lengths, or a pose or joint that is not finite.
     """
 
     object: str
@@ -30,21 +62,193 @@ class GraspCandidates:
     pregrasp: Float[Tensor, "c 20"]
     grasp: Float[Tensor, "c 20"]
     grasp_class: tuple[str, ...]
+    joints: Float[Tensor, "c 20"] = UNKNOWN
+    contacts: Float[Tensor, "c k 3"] = UNKNOWN
+    contact_finger: Int[Tensor, "c k"] = UNKNOWN
+    energy: dict[str, Float[Tensor, " c"]] = field(default_factory=dict)
+    penetration: Float[Tensor, " c"] = UNKNOWN
+    self_penetration: Float[Tensor, " c"] = UNKNOWN
+    valid: Bool[Tensor, " c"] = UNKNOWN
+    score: Float[Tensor, " c"] = UNKNOWN
+    digest: str = ""
+    robot: str = ""
+    robot_digest: str = ""
+    settings: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("position", "quaternion", "approach", "pregrasp", "grasp"):
-            value = getattr(self, name)
-            if len(value) != len(self):
-                raise InputError(f"candidates of {self.object!r}: {name} has {len(value)} rows, not {len(self)}")
-            if not torch.isfinite(value).all():
-                raise InputError(f"candidates of {self.object!r}: {name} holds a value that is not finite")
-        if len(self) == 0:
+        count = len(self)
+        if count == 0:
             raise InputError(f"there is no grasp candidate for {self.object!r}; generate some first")
+        device = self.position.device
+        missing = torch.full((count,), torch.nan, device=device)
+        defaults = {
+            "joints": self.grasp,
+            "contacts": torch.zeros(count, 0, 3, device=device),
+            "contact_finger": torch.zeros(count, 0, dtype=torch.long, device=device),
+            "penetration": missing,
+            "self_penetration": missing,
+            "valid": torch.ones(count, dtype=torch.bool, device=device),
+            "score": missing,
+        }
+        for name, value in defaults.items():
+            if getattr(self, name) is UNKNOWN:
+                object.__setattr__(self, name, value)
+        for name, value in self.tensors().items():
+            if len(value) != count:
+                raise InputError(f"candidates of {self.object!r}: {name} has {len(value)} rows, not {count}")
+            if name in FINITE and not torch.isfinite(value).all():
+                raise InputError(f"candidates of {self.object!r}: {name} holds a value that is not finite")
 
     def __len__(self) -> int:
         return len(self.grasp_class)
 
-    def to(self, device: torch.device | str) -> "GraspCandidates":
+    def tensors(self) -> dict[str, Tensor]:
+        """Every tensor by its name; energies as "energy/<term>"."""
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: value for name, value in own.items() if isinstance(value, Tensor)} | {
+            f"energy/{name}": value for name, value in self.energy.items()
+        }
+
+    def with_tensors(self, tensors: dict[str, Tensor], grasp_class: tuple[str, ...]) -> GraspCandidates:
+        """The same object, robot and settings with other tensors, named as by `tensors`."""
+        own, energy = _split_energy(tensors)
+        return replace(self, grasp_class=grasp_class, energy=energy, **own)
+
+    def to(self, device: torch.device | str) -> GraspCandidates:
         """The same candidates on another device."""
-        moved = {k: getattr(self, k).to(device) for k in ("position", "quaternion", "approach", "pregrasp", "grasp")}
-        return GraspCandidates(object=self.object, grasp_class=self.grasp_class, **moved)
+        return self.with_tensors({k: v.to(device) for k, v in self.tensors().items()}, self.grasp_class)
+
+    def select(self, rows: Tensor | Sequence[int] | slice) -> GraspCandidates:
+        """The candidates of a mask (c,) or of indices, in that order.
+
+        Raises:
+            InputError: if none is left.
+        """
+        index = torch.arange(len(self))[rows.cpu() if isinstance(rows, Tensor) else rows]
+        classes = tuple(self.grasp_class[i] for i in index.tolist())
+        return self.with_tensors({k: v[index.to(v.device)] for k, v in self.tensors().items()}, classes)
+
+    def of_class(self, *names: str) -> Bool[Tensor, " c"]:
+        """Mask of the candidates of the given grasp classes."""
+        return torch.tensor([name in names for name in self.grasp_class], device=self.position.device)
+
+    def counts(self) -> dict[str, int]:
+        """How many candidates each grasp class has, most frequent first."""
+        return dict(Counter(self.grasp_class).most_common())
+
+    def save(self, path: Path | str) -> None:
+        """Write a safetensors file, atomically."""
+        names = sorted(set(self.grasp_class))
+        index = torch.tensor([names.index(name) for name in self.grasp_class])
+        metadata = {name: getattr(self, name) for name in TEXTS} | {"classes": names}
+        write_tensors(Path(path), FORMAT, self.tensors() | {"grasp_class": index}, metadata)
+
+    @classmethod
+    def load(
+        cls, path: Path | str, object: AffordanceObject | None = None, robot: RobotDescription | None = None
+    ) -> GraspCandidates:
+        """Read what `save` wrote and, if given, check that it was made for this object and this robot.
+
+        Raises:
+            InputError: no such file, damaged, of another format, or made for something else.
+        """
+        path = Path(path)
+        tensors, metadata = read_tensors(path, FORMAT)
+        classes = metadata.pop("classes")
+        names = tuple(classes[i] for i in tensors.pop("grasp_class").tolist())
+        own, energy = _split_energy(tensors)
+        candidates = cls(grasp_class=names, energy=energy, **own, **metadata)
+        candidates.check_fits(path, object, robot)
+        return candidates
+
+    def check_fits(self, path: Path, object: AffordanceObject | None, robot: RobotDescription | None) -> None:
+        """Refuse candidates of another object or robot.
+
+        Raises:
+            InputError: naming what differs.
+        """
+        if object is not None and self.object != object.name:
+            raise InputError(
+                f"{path} holds grasps of {self.object!r}, not of {object.name!r}: give the file of that one."
+            )
+        if object is not None and self.digest != object.digest:
+            raise InputError(
+                f"{path} was made for another shape or labelling of {object.name!r}: "
+                "make it again with experiments/grasps.py."
+            )
+        if robot is not None and self.robot != robot.name:
+            raise InputError(
+                f"{path} holds grasps for the robot {self.robot!r}, not {robot.name!r}: give the file of that one."
+            )
+        if robot is not None and self.robot_digest != hand_digest(robot):
+            raise InputError(
+                f"{path} was made for another version of the hand of {robot.name!r}: "
+                "make it again with experiments/grasps.py."
+            )
+
+
+TEXTS = ("object", "digest", "robot", "robot_digest", "settings")
+"""Fields that are text."""
+FINITE = ("position", "quaternion", "approach", "pregrasp", "grasp", "joints", "contacts")
+"""Fields in which nan and infinity are refused."""
+
+
+def _split_energy(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Plain fields, and the energies without their prefix."""
+    prefix = "energy/"
+    energy = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+    return {k: v for k, v in tensors.items() if not k.startswith(prefix)}, energy
+
+
+def concatenate(sets: Sequence[GraspCandidates]) -> GraspCandidates:
+    """All candidates of several sets of one object and one robot; settings are those of the first.
+
+    Sets with fewer contacts per candidate are filled with contact_finger 0; energies that a set lacks are nan.
+
+    Raises:
+        InputError: no set, or sets of different objects, robots or digests.
+    """
+    if not sets:
+        raise InputError("there is no set of candidates to join; give at least one")
+    first = sets[0]
+    for name in ("object", "digest", "robot", "robot_digest"):
+        values = {getattr(each, name) for each in sets}
+        if len(values) > 1:
+            raise InputError(f"candidates with different {name} cannot be joined: {', '.join(sorted(values))}")
+    width = max(each.contacts.shape[1] for each in sets)
+    tables = [_widened(each, width) for each in sets]
+    names = {name: None for table in tables for name in table}
+    joined = {
+        name: torch.cat(
+            [table.get(name, torch.full((len(each),), torch.nan)) for each, table in zip(sets, tables, strict=True)]
+        )
+        for name in names
+    }
+    return first.with_tensors(joined, tuple(name for each in sets for name in each.grasp_class))
+
+
+def _widened(candidates: GraspCandidates, width: int) -> dict[str, Tensor]:
+    """Tensors with `width` contacts per candidate."""
+    more = width - candidates.contacts.shape[1]
+    contacts = torch.nn.functional.pad(candidates.contacts, (0, 0, 0, more))
+    finger = torch.nn.functional.pad(candidates.contact_finger, (0, more))
+    return candidates.tensors() | {"contacts": contacts, "contact_finger": finger}
+
+
+def hand_digest(robot: RobotDescription) -> str:
+    """sha256 of what a stored grasp depends on: joints, limits and couplings of the hand, and the tree and
+    collision shapes of the links that move with the wrist. Gains and the arm do not count."""
+    joints = [joint for joint in robot.model.joints.values() if _carried(robot, joint.child)]
+    digest = hashlib.sha256()
+    for joint in sorted(joints, key=lambda joint: joint.name):
+        digest.update(f"{joint.name} {joint.kind} {joint.parent} {joint.child}".encode())
+        digest.update(np.round([*joint.origin.ravel(), *joint.axis, joint.lower, joint.upper], DIGITS).tobytes())
+    links = sorted({robot.wrist_link} | {joint.child for joint in joints})
+    digest.update(repr([(link, robot.shapes.get(link, ())) for link in links]).encode())
+    digest.update(repr((robot.hand.names, robot.couplings)).encode())
+    return digest.hexdigest()
+
+
+def _carried(robot: RobotDescription, link: str) -> bool:
+    """Whether a link hangs on the wrist."""
+    return any(joint.parent == robot.wrist_link for joint in robot.model.chain(link))

@@ -14,8 +14,8 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from dora.agents.config import RunConfig, config_from_dict
-from dora.agents.files import write_bytes
 from dora.errors import InputError
+from dora.files import write_bytes
 
 FORMAT = "dora-checkpoint"
 VERSION = 1

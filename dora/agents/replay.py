@@ -9,8 +9,8 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 
-from dora.agents.files import write_bytes
 from dora.errors import InputError
+from dora.files import write_bytes
 
 SHARD = 16_384  # transitions per file at most
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, stdev
 
-from dora.agents.files import write_bytes
 from dora.errors import InputError
+from dora.files import write_bytes
 
 COLOURS = {
     ("ppo", "affordance"): "#c0392b",

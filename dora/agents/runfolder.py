@@ -10,8 +10,8 @@ import yaml
 
 from dora.agents.config import RunConfig, config_from_dict
 from dora.agents.evaluate import Evaluation
-from dora.agents.files import write_bytes, write_csv, write_json
 from dora.errors import InputError
+from dora.files import write_bytes, write_csv, write_json
 
 PACKAGES = ("dora", "mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 CURVE_HEADER = (

@@ -55,7 +55,7 @@ class SerialChain:
         for joint in joints:
             fixed = fixed @ joint.origin
             if joint.moves:
-                terms = _rodrigues(joint.axis)
+                terms = rodrigues(joint.axis)
                 for matrices, term in zip((constant, cosine, sine), terms, strict=True):
                     matrices.append(fixed @ term)
                 fixed = np.eye(4)
@@ -152,7 +152,7 @@ class SerialChain:
         return torch.clamp(q + step, self.lower, self.upper) - q
 
 
-def _rodrigues(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def rodrigues(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Matrices (4, 4) with Rot(axis, q) = constant + cosine cos q + sine sin q."""
     x, y, z = axis / np.linalg.norm(axis)
     constant, cosine, sine = np.zeros((3, 4, 4))

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dora.errors import InputError
 from dora.sim.batch.queries import ContactScanner
 from dora.sim.batch.scene import BatchScene
+from dora.sim.substeps import watch_physics
 
 
 @dataclass(frozen=True)
@@ -37,24 +38,33 @@ class ContactMonitor:
     ``groups``.
 
     PhysX reports the contacts of the last physics step only. To catch blows that are shorter than a control
-    step, call `sample` after every physics step (from ``_after_simulation_step``) and `take` once per
-    control step.
+    step, let the monitor collect those of every physics step and `take` them once per control step.
 
     Args:
         scene: the ManiSkill scene of the bodies; make a new monitor after a reconfiguration.
         groups: actors or links by the name of their group. A body may be in one group only.
         pairs: names of the two groups of every pair that matters, in any order; all pairs by default. Points of
             other pairs are not even looked at, which is most of the cost of a hand full of fingers.
+        located: those of the pairs whose contact points `points` gives; none by default. A pair is (group, other).
+        every_step: collect the contacts of every physics step for `take`. Not on a GPU.
 
     Raises:
         InputError: if a body is in two groups, or a pair names an unknown group.
     """
 
-    def __init__(self, scene: Any, groups: Mapping[str, Sequence[Any]], pairs: Iterable[tuple[str, str]] | None = None):
+    def __init__(
+        self,
+        scene: Any,
+        groups: Mapping[str, Sequence[Any]],
+        pairs: Iterable[tuple[str, str]] | None = None,
+        located: Iterable[tuple[str, str]] = (),
+        every_step: bool = False,
+    ):
         self.names = tuple(groups)
         wanted = _wanted(self.names, pairs)
+        places = _places(self.names, located)
         self._scene = scene
-        self._sampled: list[Contacts] = []
+        self._collector: _GroupScanner | None = None
         if scene.gpu_sim_enabled and not isinstance(scene, BatchScene):
             self._scanner, self._pairs = None, _gpu_pairs(groups, wanted)
             return
@@ -62,35 +72,54 @@ class ContactMonitor:
             readers = [system.get_contacts for system in scene.px.systems]
         else:
             readers = [scene.px.get_contacts]
-        self._scanner = _GroupScanner(readers, groups, wanted)
+        self._scanner = _GroupScanner(readers, groups, wanted, places)
         if isinstance(scene, BatchScene):
             scene.px.stepper.scanners.append(self._scanner)
+        if every_step:
+            self._collector = _GroupScanner(readers, groups, wanted, places)
+            watch_physics(scene, self._collector.scan)
 
     def read(self) -> Contacts:
         """Contacts of the last physics step."""
-        if self._scanner is None:
-            return self._read_gpu()
-        if isinstance(self._scene, BatchScene):
-            self._scene.px.stepper.scan_contacts(self._scanner)
-            return self._scanner.result()
-        self._scanner.begin_step()
-        self._scanner.scan(0)
-        return self._scanner.result()
+        scanner = self._scanned()
+        return scanner.result() if scanner else self._read_gpu()
 
-    def sample(self) -> None:
-        """Remember the contacts of the physics step just made, for `take`."""
-        self._sampled.append(self.read())
+    def _scanned(self) -> "_GroupScanner | None":
+        """The scanner, having seen the contacts of the last physics step; None on a GPU."""
+        if self._scanner and isinstance(self._scene, BatchScene):
+            self._scene.px.stepper.scan_contacts(self._scanner)
+        elif self._scanner:
+            self._scanner.begin_step()
+            self._scanner.scan(0)
+        return self._scanner
+
+    def points(self, count: int) -> tuple[Float[Tensor, "n k 3"], Int[Tensor, "n k"]]:
+        """Contact points of the located pairs in the last physics step that carry an impulse.
+
+        Args:
+            count: k, rows for every environment; further points are left out.
+
+        Returns:
+            Positions [m], world frame, and the index of the pair's first group; -1 in empty rows, which stand last.
+            Empty on a GPU.
+        """
+        if scanner := self._scanned():
+            return scanner.points(count)
+        environments = self._scene.num_envs
+        return torch.zeros(environments, count, 3), torch.full((environments, count), -1)
 
     def take(self) -> Contacts:
-        """Contacts since the last `take`: impulses summed and separations minimal over the samples.
+        """Contacts since the last `take`: impulses summed, separations minimal over the physics steps.
 
-        Without samples these are the contacts of the last physics step.
+        Unless the monitor collects every step, these are the contacts of the last one.
         """
-        samples, self._sampled = self._sampled or [self.read()], []
-        return Contacts(
-            impulse=torch.stack([sample.impulse for sample in samples]).sum(0),
-            separation=torch.stack([sample.separation for sample in samples]).amin(0),
-        )
+        if self._collector is None:
+            return self.read()
+        if isinstance(self._scene, BatchScene):
+            self._scene.px.stepper.flush()
+        contacts = self._collector.result()
+        self._collector.clear()
+        return contacts
 
     def _read_gpu(self) -> Contacts:
         count = len(self.names)
@@ -116,6 +145,15 @@ def _wanted(names: tuple[str, ...], pairs: Iterable[tuple[str, str]] | None) -> 
     return wanted
 
 
+def _places(names: tuple[str, ...], located: Iterable[tuple[str, str]]) -> list[int]:
+    """Per (first, second) group in one flat list: the located group of the two, or -1 if they are not located."""
+    places = [-1] * len(names) ** 2
+    for one, other in located:
+        first, second = names.index(one), names.index(other)
+        places[first * len(names) + second] = places[second * len(names) + first] = first
+    return places
+
+
 def _gpu_pairs(groups: Mapping[str, Sequence[Any]], wanted: Sequence[bool]) -> list[tuple[int, int, Any, Any]]:
     members = list(enumerate(groups.values()))
     return [
@@ -136,9 +174,10 @@ class _GroupScanner(ContactScanner):
         readers: Sequence[Callable[[], list]],
         groups: Mapping[str, Sequence[Any]],
         wanted: Sequence[bool],
+        places: Sequence[int],
     ):
         super().__init__(readers)
-        self._wanted = wanted
+        self._wanted, self._places = wanted, places
         self._count = len(groups)
         self._group_of: dict[int, int] = {}
         members = [member for group in groups.values() for member in group]
@@ -154,6 +193,9 @@ class _GroupScanner(ContactScanner):
         self._slots: list[int] = []
         self._impulses: list[np.ndarray] = []
         self._separations: list[float] = []
+        self._point_slots: list[tuple[int, int]] = []
+        self._point_impulses: list[np.ndarray] = []
+        self._positions: list[np.ndarray] = []
 
     def take(self, environment: int, contacts: list) -> None:
         """Collect the points between groups: slot (environment, first, second), impulse on the first, separation."""
@@ -174,6 +216,27 @@ class _GroupScanner(ContactScanner):
                 self._slots.append(slot)
                 self._impulses.append(point.impulse)
                 self._separations.append(point.separation)
+            if (place := self._places[pair]) >= 0:
+                for point in contact.points:
+                    self._point_slots.append((environment, place))
+                    self._point_impulses.append(point.impulse)
+                    self._positions.append(point.position)
+
+    def points(self, count: int) -> tuple[Tensor, Tensor]:
+        """The located points that carry an impulse, `count` rows for every environment."""
+        shape = (len(self._readers), count)
+        position, group = np.zeros((*shape, 3), np.float32), np.full(shape, -1)
+        if self._point_slots:
+            loaded = np.array(self._point_impulses).any(-1)
+            environment, place = np.array(self._point_slots)[loaded].T
+            order = np.argsort(environment, kind="stable")
+            environment = environment[order]
+            row = np.arange(len(order)) - np.searchsorted(environment, environment)
+            kept = row < count
+            slot = environment[kept], row[kept]
+            position[slot] = np.array(self._positions)[loaded][order][kept]
+            group[slot] = place[order][kept]
+        return torch.from_numpy(position), torch.from_numpy(group)
 
     def result(self) -> Contacts:
         """The points added up."""

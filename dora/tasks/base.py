@@ -6,153 +6,43 @@ from typing import Any, ClassVar, cast
 
 import gymnasium as gym
 import numpy as np
-import sapien
 import torch
-from mani_skill.sensors.camera import CameraConfig
-from mani_skill.utils import sapien_utils
-from mani_skill.utils.structs import Actor
-from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dora.affordance.candidates import GraspCandidates
 from dora.errors import InputError
-from dora.sim.properties import ObjectProperties
-from dora.sim.robot import DescribedRobot
-from dora.tasks.episode import Episode
-from dora.tasks.guidance import GraspReference, Target, wrist_step
-from dora.tasks.judging import JudgedEnv
-from dora.tasks.options import check_options
-from dora.tasks.reading import SimulatorReader
-from dora.tasks.scene import add_table
-from dora.tasks.snapshot import Snapshot, advanced
-
-CANDIDATE_DRAWS = 26
-"""Random numbers of a candidate's error: 3 position, 3 rotation, 20 joints."""
+from dora.sim.batch.actions import check_action
+from dora.tasks.building import BuiltEnv
+from dora.tasks.choice import ERROR_DRAWS
+from dora.tasks.correction import Target, wrist_step
+from dora.tasks.options import FILTER
+from dora.tasks.snapshot import Snapshot, advanced, lifted
 
 
-class DoraEnv(JudgedEnv):
-    """A task is `STAGES`, `TERMS`, `place` (random numbers -> initial state), an object and its candidates.
-
-    Args:
-        guidance: "affordance" puts candidates into observation, reward and action; "none" removes exactly that.
-        hand_joints: 20 independent hand targets, or 15 with distal joints coupled to medial ones.
-        preset: how much episodes are randomised, see `dora.tasks.presets`.
-        robot_uids: name of a folder in `robots/`.
-        sim_backend: as in ManiSkill; "auto" on a machine without CUDA is "physx_cpu", or "physx_cpu_batch" for
-            num_envs > 1.
-        kwargs: everything else that `BaseEnv` takes.
-
-    Raises:
-        InputError: for an unknown guidance, hand, preset, robot or control mode, or num_envs < 1.
-    """
-
-    SUPPORTED_ROBOTS: ClassVar[list[str]] = ["diana7_hit"]
+class DoraEnv(BuiltEnv):
+    """A task is `STAGES`, `TERMS`, `place` (random numbers -> initial state), an object and its candidates."""
 
     DRAWS: ClassVar[int]
-    """How many uniform random numbers one initial state needs, besides the candidate's error."""
-    CONTROL_FREQUENCY: ClassVar[int] = 20
-    """Control steps per second [Hz]."""
-    PHYSICS_FREQUENCY: ClassVar[int] = 100
-    """Physics steps per second [Hz]."""
-    SOLVER_ITERATIONS: ClassVar[int] = 6
-    """PhysX position iterations."""
-    CONTACT_OFFSET: ClassVar[float] = 0.005
-    """Distance at which PhysX begins to see a contact of a body without its own setting [m]."""
+    """How many uniform random numbers one initial state needs, besides mass, friction and errors."""
 
-    agent: DescribedRobot
-    target_object: Actor
-    object_half: Tensor
-
-    @abstractmethod
-    def candidates(self) -> GraspCandidates:
-        """Grasps of the task's object."""
-
-    @abstractmethod
-    def load_object(self, scale: np.ndarray) -> Actor:
-        """Builds the object into every sub-scene, `scale` (n,) times its size; sets `object_half` (n, 3) [m]."""
+    _snapshot: Snapshot | None = None
+    _seen: Snapshot
 
     @abstractmethod
     def place(self, env_idx: Tensor, u: Tensor) -> None:
         """Puts the object of the environments `env_idx` (b,) where `u` (b, DRAWS) in [0, 1) says."""
 
-    def __init__(
-        self,
-        *args: Any,
-        guidance: str = "affordance",
-        hand_joints: int = 20,
-        preset: str = "standard",
-        robot_uids: Any = "diana7_hit",
-        num_envs: int = 1,
-        control_mode: str | None = None,
-        sim_backend: str = "auto",
-        render_backend: str = "auto",
-        render_mode: str | None = None,
-        obs_mode: str | None = None,
-        **kwargs: Any,
-    ):
-        options = check_options(
-            guidance, hand_joints, preset, robot_uids, num_envs, control_mode,
-            sim_backend, render_backend, render_mode, obs_mode,
-        )  # fmt: skip
-        self.guided, self.preset = options.guided, options.preset
-        self._snapshot: Snapshot | None = None
-        self._forced_scale: Tensor | None = None
-        super().__init__(
-            *args,
-            num_envs=num_envs,
-            robot_uids=options.robot,
-            control_mode=options.control_mode,
-            sim_backend=options.sim_backend,
-            render_backend=options.render_backend,
-            render_mode=render_mode,
-            obs_mode=obs_mode,
-            **kwargs,
-        )
+    def masses(self, nominal: Float[Tensor, " b"], u: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
+        """Masses of new episodes [kg] from the objects' nominal ones and uniform random numbers."""
+        return nominal * (1 + self.preset.mass * (2 * u - 1))
 
-    # ------------------------------------------------------------------ scene
+    def reachable(self, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]) -> Bool[Tensor, "b c"]:
+        """f_reach: which candidates the arm can grasp without collision when the object stands like this."""
+        return torch.ones(len(object_p), len(self.guide.choice.candidates), dtype=torch.bool, device=self.device)
 
-    @property
-    def _default_sim_config(self) -> SimConfig:
-        return SimConfig(
-            sim_freq=self.PHYSICS_FREQUENCY,
-            control_freq=self.CONTROL_FREQUENCY,
-            scene_config=SceneConfig(
-                contact_offset=self.CONTACT_OFFSET,
-                solver_position_iterations=self.SOLVER_ITERATIONS,
-                solver_velocity_iterations=1,
-                sleep_threshold=0.0,
-            ),
-            default_materials_config=DefaultMaterialsConfig(static_friction=0.9, dynamic_friction=0.9),
-        )
-
-    @property
-    def _default_human_render_camera_configs(self) -> CameraConfig:
-        pose = sapien_utils.look_at(eye=[1.05, 0.62, 0.48], target=[0.42, 0.02, 0.2])
-        return CameraConfig("render_camera", pose, width=640, height=640, fov=0.8, near=0.01, far=10)
-
-    def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
-        super()._load_agent(options, sapien.Pose())
-
-    def _load_scene(self, options: dict) -> None:
-        self.table = add_table(self.scene)
-        self.scale = self._forced_scale if self._forced_scale is not None else self._draw_scale()
-        self.target_object = self.load_object(self.scale.cpu().numpy())
-        self._reader = SimulatorReader(self.scene, self.agent, self.target_object, self.table)
-        self._properties = ObjectProperties(self.target_object)
-        self._load_judgement()
-        self.reference = GraspReference(self.candidates(), self.num_envs, self.action_size, self.device)
-        self.episode = Episode(self.num_envs, self.action_size, self.device)
-        self._home = self.agent.posture_wrist("home")
-
-    def _draw_scale(self) -> Tensor:
-        """(n,) relative sizes, one draw from each environment's own stream."""
-        share = np.asarray(self._batched_episode_rng.uniform(size=(1,))).reshape(-1)
-        return torch.tensor(1 + self.preset.size * (2 * share - 1), dtype=torch.float32, device=self.device)
-
-    @property
-    def action_size(self) -> int:
-        """Number of action components."""
-        return int(np.prod(self.agent.single_action_space.shape or ()))
+    def extended(self, s: Snapshot) -> Snapshot:
+        """The snapshot with what this task reads in addition: a subclass of `Snapshot`."""
+        return s
 
     # ---------------------------------------------------------------- reading
 
@@ -160,12 +50,20 @@ class DoraEnv(JudgedEnv):
     def snapshot(self) -> Snapshot:
         """The state after the last control step or reset; read from the simulator at most once."""
         if self._snapshot is None:
-            self._snapshot = self._read()
+            self._snapshot = self._read(self._elapsed_steps)
         return self._snapshot
 
-    def _read(self) -> Snapshot:
-        time = self._elapsed_steps / self.MAX_STEPS
-        return self._reader.snapshot(self.machine, self.reference, self.episode, self.object_half, time)
+    @property
+    def seen(self) -> Snapshot:
+        """The same state with the preset's noise: what the policy and the reference know of it."""
+        _ = self.snapshot
+        return self._seen
+
+    def _read(self, step: Int[Tensor, " n"]) -> Snapshot:
+        time = step / self.MAX_STEPS
+        s = self.extended(self._reader.snapshot(self.machine, self.guide, self.episode, self.object_half, time))
+        self._seen = self.disturbances.seen(s, self.guide.choice, step)
+        return s
 
     # ------------------------------------------------------------------ reset
 
@@ -187,30 +85,37 @@ class DoraEnv(JudgedEnv):
 
     def _initialize_episode(self, env_idx: Tensor, options: dict) -> None:
         # One draw per environment from its own stream: neither num_envs nor the others' resets change it.
-        size = self.DRAWS + 2 + CANDIDATE_DRAWS
+        parts = [self.DRAWS, 1, 1, ERROR_DRAWS, 1]
+        size = sum(parts)
         draws = np.asarray(self._batched_episode_rng[env_idx.cpu().numpy()].uniform(size=(size,)))
         u = torch.as_tensor(draws, dtype=torch.float32, device=self.device).reshape(len(env_idx), size)
-        place, mass, friction, error = u.split([self.DRAWS, 1, 1, CANDIDATE_DRAWS], -1)
-        home = self.agent.description.postures["home"]
+        place, mass, friction, error, key = u.split(parts, -1)
+        home = self.agent.description.postures[self.HOME]
         qpos = torch.from_numpy(self.agent.qpos_of(home.arm, home.hand)).to(self.device)
         self.agent.robot.set_qpos(qpos.expand(len(env_idx), -1))
         if self.agent.commands_wrist:
             joints = torch.tensor(np.concatenate([home.arm, home.hand]), dtype=torch.float32, device=self.device)
             self.agent.wrist_controller.begin(env_idx, joints.expand(len(env_idx), -1))
         self.place(env_idx, place)
-        pose, e, rows = self.target_object.pose, self.episode, len(env_idx)
+        pose, e = self.target_object.pose, self.episode
         e.begin(env_idx, pose.p[env_idx])
         low, high = self.preset.friction
         nominal = torch.tensor(self._properties.nominal, device=self.device)[env_idx]
-        e.mass[env_idx] = nominal * (1 + self.preset.mass * (2 * mass[:, 0] - 1))
+        e.mass[env_idx] = self.masses(nominal, mass[:, 0])
         e.friction[env_idx] = low + (high - low) * friction[:, 0]
         self._apply_properties(env_idx)
         self.machine.reset(env_idx)
-        wrist_p, wrist_q = self._home
-        self.reference.choose(
-            env_idx, pose.p[env_idx], pose.q[env_idx],
-            wrist_p.expand(rows, 3), wrist_q.expand(rows, 4), 2 * error - 1, self.preset,
-        )  # fmt: skip
+        self.disturbances.begin(env_idx, key[:, 0])
+        self._choose(env_idx, pose.p[env_idx], pose.q[env_idx], 2 * error - 1)
+
+    def _choose(self, env_idx: Tensor, object_p: Tensor, object_q: Tensor, error: Tensor) -> None:
+        """Gives new episodes their candidates and starts their references."""
+        wrist_p, wrist_q = (x.expand(len(env_idx), -1) for x in self._home)
+        choice, reachable = self.guide.choice, self.reachable(object_p, object_q)
+        wanted = reachable if FILTER in self.parts else torch.ones_like(reachable)
+        index = choice.nearest(object_p, object_q, wrist_p, wrist_q, wanted)
+        choice.choose(env_idx, index, reachable.any(-1), error, self.preset)
+        self.guide.begin(env_idx, wrist_p, wrist_q)
 
     def _apply_properties(self, env_idx: Tensor) -> None:
         e = self.episode
@@ -230,20 +135,23 @@ class DoraEnv(JudgedEnv):
         return super().step(action)
 
     def _step_action(self, action: Any) -> Any:
-        action = self._checked(action)
+        action, step = self._checked(action), self._elapsed_steps
         if action is not None:
             self.episode.record_action(action)
+            action = self.disturbances.delayed(action, step)
+        self._push(self.disturbances.pushes(step))
         super()._step_action(None if action is None else self._command(action))
-        self.episode.record_contacts(self._reader.contacts(), self.PHYSICS_FREQUENCY)
-        s = self._read()
+        seen = self.CONTROL_FREQUENCY if self.CONTACT_EVERY_STEP else self.PHYSICS_FREQUENCY
+        self.episode.record_contacts(self._reader.contacts(), seen)
+        if self.CONTACT_POINTS:
+            self.episode.record_points(*self._reader.points())
+        s = self._read(step + 1)  # ManiSkill counts the step after this method
+        self.episode.record_rise(lifted(s))
         self.machine.advance(s)
-        self.reference.advance(s)
-        self._snapshot = advanced(
-            s,
-            stage=self.machine.index.clone(),
-            phase=self.reference.phase.index.clone(),
-            time=(self._elapsed_steps + 1) / self.MAX_STEPS,  # ManiSkill counts the step after this method
-        )
+        self.reference.advance(self._seen)
+        moved = {"stage": self.machine.index.clone(), "phase": self.reference.one_hot()}
+        self._snapshot = advanced(s, **moved)
+        self._seen = self._snapshot if self._seen is s else advanced(self._seen, **moved)
         return action
 
     def _checked(self, action: Any) -> Tensor | None:
@@ -251,21 +159,21 @@ class DoraEnv(JudgedEnv):
         if action is None:
             return None
         out = torch.as_tensor(action, dtype=torch.float32, device=self.device)
-        shape = (self.num_envs, self.action_size)
-        if self.num_envs == 1 and out.shape == shape[1:]:
-            out = out[None]
-        if out.shape != shape:
-            raise InputError(f"the action has the shape {tuple(out.shape)}; this environment needs {shape}")
-        if not torch.isfinite(out).all():
-            raise InputError("the action holds NaN or infinity; nothing was moved")
-        return out
+        check_action(self, out)
+        return out.reshape(self.num_envs, self.action_size)
+
+    def _push(self, impulse: Float[Tensor, "n 3"]) -> None:
+        """Gives objects an impulse [N s] at their centres of mass in the next physics step."""
+        for row in impulse.any(-1).nonzero()[:, 0].tolist():
+            body = self.target_object._bodies[row]
+            centre = (body.entity_pose * body.cmass_local_pose).p
+            body.add_force_at_point(impulse[row].cpu().numpy(), centre, "impulse")
 
     def _command(self, action: Tensor) -> Tensor:
-        """What the controller is asked: the action itself, or the corrected reference if guided."""
-        if not (self.guided and self.agent.commands_wrist):
+        """What the controller is asked: the action itself, or the corrected reference."""
+        if not self.corrects:
             return action
-        target, expand = self.reference.target(self.snapshot), self.agent.wrist_controller.expand_hand
-        return self._encode(self.reference.corrected(target, action.clamp(-1, 1), expand))
+        return self._encode(self.guide.corrected(self.seen, action, self.agent.wrist_controller.expand_hand))
 
     def _encode(self, target: Target) -> Tensor:
         """A wrist and hand target as an action of the wrist controller."""
@@ -277,12 +185,12 @@ class DoraEnv(JudgedEnv):
     def scripted_action(self) -> Tensor:
         """(n, a) action that executes the chosen candidate from the present state: the scripted solution.
 
-        With guidance that is zero correction; without, the reference's target as a plain action of the default
+        Where actions correct the reference that is zero; elsewhere, its target as a plain action of the default
         controller.
         """
-        if self.guided:
+        if self.corrects:
             return torch.zeros(self.num_envs, self.action_size, device=self.device)
-        target = self.reference.target(self.snapshot)
+        target = self.reference.target(self.seen)
         self.reference.aim(target)
         return self._encode(target)
 
@@ -291,12 +199,14 @@ class DoraEnv(JudgedEnv):
     def get_state_dict(self) -> dict:
         """Simulator, controller and task state; a round trip restores stage and observation."""
         task = self.episode.get_state() | {"elapsed": self._elapsed_steps.clone(), "scale": self.scale.clone()}
-        simulation = cast(dict[str, Any], super().get_state_dict())  # annotated as a tensor
-        return simulation | {
+        ours = {
             "task": task,
             "machine": self.machine.get_state(),
-            "reference": self.reference.get_state(),
+            "guide": self.guide.get_state(),
+            "disturbances": self.disturbances.get_state(),
         }
+        rows = {name: {k: v.flatten(min(1, v.ndim - 1)) for k, v in part.items()} for name, part in ours.items()}
+        return cast(dict[str, Any], super().get_state_dict()) | rows  # annotated as a tensor
 
     def set_state_dict(self, state: dict, env_idx: Tensor | None = None) -> None:
         """Inverse of `get_state_dict`; with `env_idx` (b,) the state has b rows.
@@ -314,7 +224,8 @@ class DoraEnv(JudgedEnv):
             self.episode.set_state(state["task"], rows)
             self._elapsed_steps[rows] = state["task"]["elapsed"].reshape(-1).to(self._elapsed_steps.dtype)
             self.machine.set_state(state["machine"], rows)
-            self.reference.set_state(state["reference"], rows)
+            self.guide.set_state(state["guide"], rows)
+            self.disturbances.set_state(state["disturbances"], rows)
             self._apply_properties(rows)
         self._snapshot = None
 

@@ -13,18 +13,20 @@ OBJECT, WORLD = 6, 7
 class Episode:
     """Buffers (n, ...) allocated once and written by rows.
 
-    `start_p` [m]; `touch`, `supported` (0 or 1); `force` [N]; `penetration`, `deepest` [m]; `mass` [kg]; `friction`;
-    the last two actions.
+    `start_p` [m]; `highest` rise of the object so far [m]; `touch`, `supported` (0 or 1); `force` [N]; `penetration`,
+    `deepest` [m]; `mass` [kg]; `friction`;
+    `contact_p` [m] and `contact_finger` of up to `points` contact points, in the object frame; the last two actions.
     """
 
-    def __init__(self, num_envs: int, action_size: int, device: torch.device):
+    def __init__(self, num_envs: int, action_size: int, points: int, device: torch.device):
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(num_envs, *shape, device=device)
 
-        self.start_p = zeros(3)
+        self.start_p, self.highest = zeros(3), zeros()
         self.touch, self.force, self.supported = zeros(6), zeros(6), zeros()
         self.penetration, self.deepest = zeros(), zeros()
         self.mass, self.friction = zeros(), zeros()
+        self.contact_p, self.contact_finger = zeros(points, 3), zeros(points)
         self.action, self.previous_action = zeros(action_size), zeros(action_size)
 
     def begin(self, rows: Int[Tensor, " b"], start_p: Float[Tensor, "b 3"]) -> None:
@@ -44,6 +46,15 @@ class Episode:
         self.supported.copy_(contacts.impulse[:, OBJECT, WORLD].square().sum(-1) > 0)
         self.penetration.copy_(torch.maximum(hand, depth[:, OBJECT, WORLD]))
         torch.maximum(self.deepest, self.penetration, out=self.deepest)
+
+    def record_points(self, position: Float[Tensor, "n m 3"], finger: Int[Tensor, "n m"]) -> None:
+        """Takes over the contact points of the last physics step, object frame [m]; finger 0 marks an empty row."""
+        self.contact_p.copy_(position)
+        self.contact_finger.copy_(finger)
+
+    def record_rise(self, rise: Float[Tensor, " n"]) -> None:
+        """Takes note of the object's present height above its start [m]."""
+        torch.maximum(self.highest, rise, out=self.highest)
 
     def record_action(self, action: Float[Tensor, "n a"]) -> None:
         """Shifts the action history by one."""

@@ -9,7 +9,9 @@ from mani_skill.envs.sapien_env import BaseEnv
 from torch import Tensor
 
 from dora.tasks.episode import Episode
+from dora.tasks.guidance import Guide
 from dora.tasks.observations import OBSERVATIONS, Entry
+from dora.tasks.options import FILTER, REWARD
 from dora.tasks.rewards import Terms
 from dora.tasks.snapshot import Snapshot
 from dora.tasks.stages import Stage, StageMachine
@@ -40,7 +42,8 @@ class JudgedEnv(BaseEnv):
     DEEPEST: ClassVar[float] = 0.005
     """Penetration that spoils an episode [m]."""
 
-    guided: bool
+    parts: frozenset[str]
+    guide: Guide
     episode: Episode
     machine: StageMachine
     observation_entries: dict[str, Entry]
@@ -50,12 +53,17 @@ class JudgedEnv(BaseEnv):
     def snapshot(self) -> Snapshot:
         """The state after the last control step or reset."""
 
+    @property
+    @abstractmethod
+    def seen(self) -> Snapshot:
+        """The same state as it is observed, with the preset's noise."""
+
     def _load_judgement(self) -> None:
         """Chooses reward terms and observation entries, and starts the stages."""
         terms = self.PAPER_TERMS if self._reward_mode == "paper" else self.TERMS
-        self._terms = terms if self.guided else terms.without_guidance()
+        self._terms = terms if REWARD in self.parts else terms.without_guidance()
         entries = {**OBSERVATIONS, **self.EXTRA_OBSERVATIONS}
-        self.observation_entries = {k: e for k, e in entries.items() if self.guided or not e.guided}
+        self.observation_entries = {k: e for k, e in entries.items() if e.exists(self.parts)}
         self.machine = StageMachine(self.STAGES, self.num_envs, self.device)
 
     # ------------------------------------------------ the protocol of learners
@@ -74,7 +82,8 @@ class JudgedEnv(BaseEnv):
     def logged(self) -> tuple[str, ...]:
         """Names of the (n,) tensors in `step`'s info that are worth a curve."""
         stages = [f"stage/{name}" for name in self.stage_names]
-        return (*(f"reward/{name}" for name in self._terms.terms), *stages, "penetration_mm", "finished")
+        names = (*(f"reward/{name}" for name in self._terms.terms), *stages, "penetration_mm", "finished")
+        return (*names, "unreachable") if FILTER in self.parts else names
 
     # ---------------------------------------------------- evaluation, reward
 
@@ -83,12 +92,20 @@ class JudgedEnv(BaseEnv):
         """(n,) bool: the episode's deepest penetration is above the task's limit."""
         return self.episode.deepest > self.DEEPEST
 
+    @property
+    def unreachable(self) -> Tensor:
+        """(n,) bool: no candidate could be reached when the episode began. Such an episode fails at once and earns
+        nothing (paper, Motion-Feasibility Filtering); never so without that part of guidance."""
+        none_left = self.guide.choice.buffers["reachable"] == 0
+        return none_left if FILTER in self.parts else torch.zeros_like(none_left)
+
     def evaluate(self) -> dict[str, Tensor]:
         """Idempotent: reset and wrappers call it too, so it moves nothing."""
         finished = self.machine.finished
         info = {
             "success": finished & ~self.spoiled,
-            "fail": self.failed(self.snapshot),
+            "fail": self.failed(self.snapshot) | self.unreachable,
+            "unreachable": self.unreachable,
             "finished": finished,
             "stage": self.machine.index.clone(),
             "penetration_mm": self.episode.penetration * MM,
@@ -106,8 +123,9 @@ class JudgedEnv(BaseEnv):
     def compute_dense_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
         """Sum of the terms (n,); each one's share goes into `info["reward/<name>"]`."""
         total, parts = self._terms(self.snapshot)
-        info.update({f"reward/{name}": value for name, value in parts.items()})
-        return total
+        weight = (~self.unreachable).float()
+        info.update({f"reward/{name}": weight * value for name, value in parts.items()})
+        return weight * total
 
     def compute_normalized_dense_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
         """The dense reward over its largest possible value."""
@@ -117,7 +135,7 @@ class JudgedEnv(BaseEnv):
         """(n,) reward of the chosen mode; "paper" sums the printed terms."""
         if self._reward_mode == "paper":
             return self.compute_dense_reward(obs, action, info)
-        return super().get_reward(obs, action, info)
+        return super().get_reward(obs, action, info) * ~self.unreachable
 
     # ----------------------------------------------------------- observation
 
@@ -125,7 +143,7 @@ class JudgedEnv(BaseEnv):
         return {}
 
     def _get_obs_extra(self, info: dict) -> dict[str, Tensor]:
-        s = self.snapshot
+        s = self.seen
         return {name: entry.value(s) for name, entry in self.observation_entries.items()}
 
     def _flatten_raw_obs(self, obs: Any) -> Any:

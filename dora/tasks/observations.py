@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from dora.robot.rotations import (
@@ -13,8 +12,8 @@ from dora.robot.rotations import (
     quaternion_inverse,
     quaternion_multiply,
 )
-from dora.tasks.guidance import PHASES
-from dora.tasks.snapshot import Snapshot, goal_error, in_wrist, lifted, turned_in_wrist
+from dora.tasks.options import OBSERVATION, PRIOR
+from dora.tasks.snapshot import Snapshot, goal_error, in_wrist, lifted, near_errors, turned_in_wrist
 
 
 @dataclass(frozen=True)
@@ -25,13 +24,20 @@ class Entry:
         value: snapshot -> (n, k) tensor.
         unit: unit of the values, "1" if dimensionless.
         doc: what it is, for the documentation table.
-        guided: True if it exists only with `guidance="affordance"`.
+        guided: True if it exists only with guidance.
+        prior: True if it is about the reference that the action corrects, and exists only with that part of guidance;
+            all other guided entries belong to the part "observation".
     """
 
     value: Callable[[Snapshot], Tensor]
     unit: str
     doc: str
     guided: bool = False
+    prior: bool = False
+
+    def exists(self, parts: frozenset[str]) -> bool:
+        """Whether the entry exists with these parts of guidance."""
+        return not self.guided or (PRIOR if self.prior else OBSERVATION) in parts
 
 
 def _axes(q: Tensor) -> Tensor:
@@ -81,11 +87,12 @@ OBSERVATIONS: dict[str, Entry] = {
         True,
     ),
     "goal_hand": Entry(lambda s: s.goal_grasp - s.hand_q, "rad", "candidate's closed hand minus measured joints", True),
-    "phase": Entry(
-        lambda s: F.one_hot(s.phase, len(PHASES) + 1)[:, : len(PHASES)].float(),
-        "1",
-        "phase of the reference",
+    "near": Entry(
+        lambda s: near_errors(s)[:, 1:].flatten(1),
+        "m, rad",
+        "wrist to the next nearest candidates: position and rotation vector of each",
         True,
     ),
-    "correction": Entry(lambda s: s.correction, "1", "low-passed correction, in units of the bounds", True),
+    "phase": Entry(lambda s: s.phase, "1", "phase of the reference", True, True),
+    "correction": Entry(lambda s: s.correction, "1", "low-passed correction, in units of the bounds", True, True),
 }

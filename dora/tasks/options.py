@@ -1,5 +1,6 @@
 """The options that every Dora task takes, checked before anything is built."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,9 @@ from dora.sim.robot import CONTROL_MODES, COUPLED, DescribedRobot, register_robo
 from dora.tasks.presets import Preset, find_preset
 
 GUIDANCE = ("affordance", "none")
+OBSERVATION, REWARD, FILTER, PRIOR = PARTS = ("observation", "reward", "filter", "prior")
+"""The parts of guidance: features in the observation, terms of the reward, choice among reachable candidates only,
+and the reference that the action corrects."""
 
 
 def choose_render_backend(render_mode: str | None, obs_mode: str | None) -> str:
@@ -35,7 +39,7 @@ def choose_render_backend(render_mode: str | None, obs_mode: str | None) -> str:
 class TaskOptions:
     """Checked options of a task, with what they resolve to."""
 
-    guided: bool
+    parts: frozenset[str]
     preset: Preset
     robot: str
     control_mode: str
@@ -43,8 +47,29 @@ class TaskOptions:
     render_backend: str
 
 
+def guidance_in_force(guidance: str, parts: Sequence[str] | None) -> frozenset[str]:
+    """The parts of guidance that a task has: all of them, or those that are named; none with `guidance="none"`.
+
+    Raises:
+        InputError: for an unknown guidance or part, or parts of no guidance.
+    """
+    if guidance not in GUIDANCE:
+        raise InputError(f"unknown guidance {guidance!r}; choose one of {', '.join(GUIDANCE)}")
+    if guidance == "none":
+        if parts:
+            raise InputError('guidance="none" has no parts; leave guidance_parts out, or choose guidance="affordance"')
+        return frozenset()
+    if parts is None:
+        return frozenset(PARTS)
+    named = (parts,) if isinstance(parts, str) else tuple(parts)
+    if unknown := set(named) - set(PARTS):
+        raise InputError(f"unknown guidance part {sorted(unknown)[0]!r}; choose among {', '.join(PARTS)}")
+    return frozenset(named)
+
+
 def check_options(
     guidance: str,
+    guidance_parts: Sequence[str] | None,
     hand_joints: int,
     preset: str,
     robot_uids: Any,
@@ -63,8 +88,7 @@ def check_options(
     Raises:
         InputError: one sentence about the first option that is wrong.
     """
-    if guidance not in GUIDANCE:
-        raise InputError(f"unknown guidance {guidance!r}; choose one of {', '.join(GUIDANCE)}")
+    parts = guidance_in_force(guidance, guidance_parts)
     if hand_joints not in (15, 20):
         raise InputError(
             f"hand_joints must be 20, or 15 with distal joints coupled to medial ones, not {hand_joints!r}"
@@ -87,4 +111,4 @@ def check_options(
         sim_backend = "physx_cpu_batch" if num_envs > 1 else "physx_cpu"
     if render_backend == "auto":
         render_backend = choose_render_backend(render_mode, obs_mode)
-    return TaskOptions(guidance == "affordance", find_preset(preset), robot_uids, mode, sim_backend, render_backend)
+    return TaskOptions(parts, find_preset(preset), robot_uids, mode, sim_backend, render_backend)

@@ -1,13 +1,13 @@
-"""How much an episode is randomised: named presets, the same for every task."""
+"""How much an episode is randomised and disturbed: named presets, the same for every task."""
 
 from dataclasses import dataclass
 
 from dora.errors import InputError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Preset:
-    """Half widths and ranges of everything that is drawn anew.
+    """Half widths of uniform errors, ranges of what is drawn anew, and disturbances; all zero by default.
 
     Attributes:
         name: the preset's name.
@@ -17,23 +17,66 @@ class Preset:
         candidate_position: half width of the error of a candidate's wrist position along each axis [m].
         candidate_rotation: half width of the error of a candidate's orientation about each axis [rad].
         candidate_joint: half width of the error of a candidate's finger joints [rad].
+        seen_position: half width of the error of the observed object position along each axis [m]; drawn every
+            control step.
+        seen_rotation: half width of the error of the observed object orientation about each axis [rad]; the same.
+        seen_joint: half width of the error of the observed hand joints [rad]; the same.
+        delay: control steps after which an action takes effect.
+        push: impulse of a push on the object in a random horizontal direction [N s].
+        push_rate: mean number of pushes in a second [1/s].
     """
 
     name: str
-    size: float
-    mass: float
-    friction: tuple[float, float]
-    candidate_position: float
-    candidate_rotation: float
-    candidate_joint: float
+    size: float = 0.0
+    mass: float = 0.0
+    friction: tuple[float, float] = (0.9, 0.9)
+    candidate_position: float = 0.0
+    candidate_rotation: float = 0.0
+    candidate_joint: float = 0.0
+    seen_position: float = 0.0
+    seen_rotation: float = 0.0
+    seen_joint: float = 0.0
+    delay: int = 0
+    push: float = 0.0
+    push_rate: float = 0.0
+
+    @property
+    def noisy(self) -> bool:
+        """Whether anything that is observed differs from the truth."""
+        return max(self.seen_position, self.seen_rotation, self.seen_joint) > 0
 
 
 PRESETS = {
     p.name: p
     for p in (
-        Preset("none", 0.0, 0.0, (0.9, 0.9), 0.0, 0.0, 0.0),
-        Preset("standard", 0.08, 0.3, (0.6, 1.0), 0.005, 0.05, 0.05),
-        Preset("hard", 0.12, 0.5, (0.5, 1.0), 0.015, 0.15, 0.10),
+        Preset(name="none"),
+        Preset(
+            name="standard",
+            size=0.08,
+            mass=0.3,
+            friction=(0.6, 1.0),
+            candidate_position=0.005,
+            candidate_rotation=0.05,
+            candidate_joint=0.05,
+            seen_position=0.002,
+            seen_rotation=0.02,
+            seen_joint=0.01,
+        ),
+        Preset(
+            name="hard",
+            size=0.12,
+            mass=0.5,
+            friction=(0.5, 1.0),
+            candidate_position=0.015,
+            candidate_rotation=0.15,
+            candidate_joint=0.10,
+            seen_position=0.005,
+            seen_rotation=0.05,
+            seen_joint=0.02,
+            delay=1,
+            push=0.05,
+            push_rate=0.5,
+        ),
     )
 }
 

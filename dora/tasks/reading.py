@@ -1,17 +1,20 @@
 """The only place where a task reads the simulator."""
 
+from collections.abc import Sequence
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from mani_skill.envs.scene import ManiSkillScene
-from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs import Actor, Link
 from torch import Tensor
 
+from dora.robot.rotations import quaternion_apply, quaternion_inverse
 from dora.sim.bodies import BodyReader
 from dora.sim.contacts import ContactMonitor, Contacts
 from dora.sim.robot import DescribedRobot
 from dora.tasks.episode import Episode
-from dora.tasks.guidance import GraspReference
-from dora.tasks.snapshot import FINGERS, Snapshot
+from dora.tasks.guidance import Guide
+from dora.tasks.snapshot import CONTACT_CLASSES, FINGERS, Snapshot
 from dora.tasks.stages import StageMachine
 
 TIPS = slice(1, 1 + len(FINGERS))
@@ -25,27 +28,51 @@ class SimulatorReader:
         scene: the scene of all environments.
         agent: the robot.
         target: the manipulated object.
-        world: what the object stands on.
+        world: what the object and the hand may touch besides each other.
+        points: contact points of hand and object that are wanted; 0 if nobody asks for them.
+        every_step: collect contacts from all physics steps of a control step, not from the last one only.
     """
 
-    def __init__(self, scene: ManiSkillScene, agent: DescribedRobot, target: Actor, world: Actor):
+    def __init__(
+        self,
+        scene: ManiSkillScene,
+        agent: DescribedRobot,
+        target: Actor,
+        world: Sequence[Actor | Link],
+        points: int = 0,
+        every_step: bool = False,
+    ):
         self._agent = agent
         self._poses = BodyReader(scene, [agent.wrist, *agent.distals, target])
         self._velocities = BodyReader(scene, [agent.wrist, target])
         parts = dict(zip(FINGERS, agent.finger_links, strict=True)) | {"palm": [agent.palm]}
         pairs = [(part, other) for part in parts for other in ("object", "world")] + [("object", "world")]
-        self._contacts = ContactMonitor(scene, parts | {"object": [target], "world": [world]}, pairs)
+        located = [(part, "object") for part in parts] if points else []
+        groups = parts | {"object": [target], "world": list(world)}
+        self._contacts = ContactMonitor(scene, groups, pairs, located, every_step)
+        self._points = points
+        classes = [CONTACT_CLASSES.index(name) if name in CONTACT_CLASSES else 0 for name in groups]
+        self._classes = torch.tensor([0, *classes], device=scene.device)  # the first for an empty row
         self._arm_index = torch.tensor(agent.arm_index, device=scene.device)
         self._hand_index = torch.tensor(agent.hand_index, device=scene.device)
 
     def contacts(self) -> Contacts:
-        """Contacts of the last physics step among the fingers, the palm, the object and the world, in this order."""
-        return self._contacts.read()
+        """Contacts among the fingers, the palm, the object and the world, in this order: of the last physics step, or
+        of all steps since the last call."""
+        return self._contacts.take()
+
+    def points(self) -> tuple[Float[Tensor, "n m 3"], Int[Tensor, "n m"]]:
+        """Contact points of the hand on the object in the last physics step, object frame [m], and what touches
+        there: a place in `CONTACT_CLASSES`, 0 in empty rows."""
+        world, group = self._contacts.points(self._points)
+        pose = self._poses.poses()[:, -1:].expand(-1, self._points, 7)
+        local = quaternion_apply(quaternion_inverse(pose[..., 3:]), world - pose[..., :3])
+        return torch.where((group >= 0)[..., None], local, 0.0), self._classes[group + 1]
 
     def snapshot(
         self,
         machine: StageMachine,
-        reference: GraspReference,
+        guide: Guide,
         episode: Episode,
         object_half: Float[Tensor, "n 3"],
         time: Float[Tensor, " n"],
@@ -54,7 +81,7 @@ class SimulatorReader:
 
         Args:
             machine: stages of the task.
-            reference: candidate, phase and correction.
+            guide: candidates, phase and correction.
             episode: what the episode remembers, its contacts being up to date.
             object_half: half extents of the object [m].
             time: share of the episode that is over.
@@ -63,8 +90,8 @@ class SimulatorReader:
         p, q, v, w = pose[..., :3], pose[..., 3:], velocity[..., :3], velocity[..., 3:]
         qpos, qvel = self._agent.robot.get_qpos(), self._agent.robot.get_qvel()
         tip_p, tip_q = self._agent.tips_of(p[:, TIPS], q[:, TIPS])
-        hand_q, e, r = qpos[:, self._hand_index], episode, reference
-        goal_p, goal_q = r.goal(p[:, -1], q[:, -1])
+        hand_q, e, chosen = qpos[:, self._hand_index], episode, guide.choice.buffers
+        near_p, near_q, approach = guide.choice.goals(p[:, -1], q[:, -1])
         return Snapshot(
             arm_q=qpos[:, self._arm_index], hand_q=hand_q, hand_v=qvel[:, self._hand_index],
             hand_target=self._hand_target(hand_q),
@@ -75,9 +102,10 @@ class SimulatorReader:
             penetration=e.penetration.clone(), deepest=e.deepest.clone(),
             stage=machine.index.clone(), time=time,
             action=e.action.clone(), previous_action=e.previous_action.clone(),
-            goal_p=goal_p, goal_q=goal_q,
-            goal_pregrasp=r.buffers["pregrasp"].clone(), goal_grasp=r.buffers["grasp"].clone(),
-            phase=r.phase.index.clone(), correction=r.buffers["correction"].clone(),
+            goal_p=near_p[:, 0], goal_q=near_q[:, 0], goal_approach=approach, near_p=near_p, near_q=near_q,
+            goal_pregrasp=chosen["pregrasp"].clone(), goal_grasp=chosen["grasp"].clone(),
+            phase=guide.reference.one_hot(), correction=guide.correction.value.clone(),
+            contact_p=e.contact_p.clone(), contact_finger=e.contact_finger.long(),
         )  # fmt: skip
 
     def _hand_target(self, measured: Tensor) -> Tensor:

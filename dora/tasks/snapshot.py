@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import wraps
 from typing import Any
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -17,6 +18,10 @@ from dora.robot.rotations import (
 
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 """Finger order of every tensor with a finger axis."""
+
+
+CONTACT_CLASSES = ("none", "palm", *FINGERS)
+"""Names of the values of `Snapshot.contact_finger`."""
 
 
 DERIVED = "_derived"
@@ -45,9 +50,13 @@ class Snapshot:
         time: share of the episode that is over, 0 to 1.
         action, previous_action: last two actions, as given.
         goal_p, goal_q: wrist pose that the chosen candidate asks for now (it follows the object).
+        goal_approach: unit direction of the wrist's last motion towards it, world frame.
         goal_pregrasp, goal_grasp: hand joints of that candidate [rad].
-        phase: index of the reference's phase.
+        near_p, near_q: the same poses for the nearest reachable candidates, the chosen one first.
+        phase: the reference's phase, one-hot.
         correction: low-passed correction of the reference, in units of the bounds.
+        contact_p: contact points of the hand on the object in the last physics step, object frame [m].
+        contact_finger: what touches there: 0 nothing (an empty row), 1 palm, 2 thumb, ... 6 pinky.
     """
 
     arm_q: Float[Tensor, "n 7"]
@@ -77,10 +86,15 @@ class Snapshot:
     previous_action: Float[Tensor, "n a"]
     goal_p: Float[Tensor, "n 3"]
     goal_q: Float[Tensor, "n 4"]
+    goal_approach: Float[Tensor, "n 3"]
     goal_pregrasp: Float[Tensor, "n 20"]
     goal_grasp: Float[Tensor, "n 20"]
-    phase: Int[Tensor, " n"]
+    near_p: Float[Tensor, "n k 3"]
+    near_q: Float[Tensor, "n k 4"]
+    phase: Float[Tensor, "n p"]
     correction: Float[Tensor, "n a"]
+    contact_p: Float[Tensor, "n m 3"]
+    contact_finger: Int[Tensor, "n m"]
 
 
 Derived = Callable[[Snapshot], Any]
@@ -133,6 +147,14 @@ def goal_error(s: Snapshot) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]
     """Position [m] and rotation vector [rad] from the wrist to the candidate's goal, in the hand-base frame."""
     turn = quaternion_multiply(quaternion_inverse(s.wrist_q), s.goal_q)
     return in_wrist(s, s.goal_p), rotation_vector_from_quaternion(turn)
+
+
+@derived
+def near_errors(s: Snapshot) -> Float[Tensor, "n k 6"]:
+    """Position [m] and rotation vector [rad] from the wrist to each of the near candidates, in the hand-base frame."""
+    back = quaternion_inverse(s.wrist_q)[:, None].expand_as(s.near_q)
+    shift = quaternion_apply(back, s.near_p - s.wrist_p[:, None])
+    return torch.cat([shift, rotation_vector_from_quaternion(quaternion_multiply(back, s.near_q))], -1)
 
 
 @derived

@@ -49,6 +49,9 @@ class Stepper:
     environment in a control step is done at one go: its drive targets are set, all its physics steps made,
     its state and its contacts read; then comes the next. To that end `defer` lets writes and steps wait.
     Environments do not interact, so results do not depend on this order.
+
+    Each of `watchers` is called with the number of an environment after every physics step that this environment has
+    made, before its next one.
     """
 
     def __init__(self, scenes: Sequence[sapien.Scene]):
@@ -57,6 +60,7 @@ class Stepper:
         self.state = PackedSource([system.pack for system in systems])
         self.contacts = ContactImpulses([system.get_contacts for system in systems])
         self.scanners: list[ContactScanner] = [self.contacts]
+        self.watchers: list[Callable[[int], None]] = []
         self.profile: StepProfile | None = None
         self.resized: Callable[[], None] = lambda: None
         self._steps = [system.step for system in systems]
@@ -115,6 +119,8 @@ class Stepper:
                 profile.add("write")
             for _ in steps:
                 step()
+                for watch in self.watchers:
+                    watch(environment)
             if profile:
                 profile.add("physics")
             for source in sources:

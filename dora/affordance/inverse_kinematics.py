@@ -1,0 +1,263 @@
+"""Batched inverse kinematics of the arm: seeds from a table of postures, then damped least squares within limits.
+
+A turn of the first joint turns the wrist about that joint's axis and does nothing else. The table therefore holds
+postures with the first joint at zero and the wrist poses they give; a target is first turned about the axis until its
+azimuth is zero, the nearest wrist poses of the table are looked up, and the azimuth is given back to the first joint.
+From such a seed the target is a few steps of
+
+    dq = J^T (J J^T + lambda^2 I)^-1 e,   lambda^2 = DAMPING_FLOOR + DAMPING_GAIN |e|^2
+
+away (Sugihara 2011, Levenberg-Marquardt with an error-dependent damping): robust far from the target and nearly
+quadratic close to it. A joint at a limit that the step would leave takes no part in that step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dora.errors import InputError
+from dora.robot import RobotDescription, SerialChain
+from dora.robot.kinematics import Frames
+from dora.robot.rotations import matrix_from_quaternion
+
+POSITION_TOLERANCE = 2e-4
+"""Largest error of a solution's wrist position [m]."""
+ANGLE_TOLERANCE = 2e-3
+"""Largest error of a solution's wrist orientation [rad]."""
+LIMIT_MARGIN = 0.01
+"""Distance that solutions keep from the joint limits [rad]; the wrist controller keeps the same."""
+DAMPING_FLOOR = 1e-5
+"""lambda^2 at the target."""
+DAMPING_GAIN = 0.02
+"""Growth of lambda^2 with the squared error (m^2 and rad^2 together)."""
+LARGEST_STEP = 0.6
+"""Largest change of a joint in one iteration [rad]."""
+PULLED = 4
+"""Iterations that also pull towards the start posture in the null space."""
+PULL = 0.2
+"""Share of the way to the start posture in such an iteration."""
+METRES_PER_RADIAN = 0.3
+"""What a radian of orientation counts in the search for seeds [m/rad]."""
+METRES_PER_JOINT_RADIAN = 0.03
+"""What a radian of distance from the start posture counts in the search for seeds [m/rad]."""
+TABLE_SIZE = 8192
+"""Postures in the table of seeds."""
+CHUNK = 512
+"""Targets looked up at once; bounds the memory."""
+MARGIN_SCALE = 0.1
+"""Distance from a joint limit below which a solution becomes dear [rad]."""
+MARGIN_COST = 1.0
+"""Cost of a joint at its limit, in radians of distance from the start posture."""
+MANIPULABILITY_SCALE = 0.02
+"""sqrt(det(J J^T)) below which a solution becomes dear [m^3 / rad^3]."""
+MANIPULABILITY_COST = 1.0
+"""Cost of a singular posture, in radians of distance from the start posture."""
+LAST = 1e3
+"""More than any solution's cost [rad]: puts what is not solved last."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solutions:
+    """Postures for n wrist poses, s for each, solved ones first and of these the best first.
+
+    Attributes:
+        q: (n, s, dof) arm joints [rad], always finite and within the limits.
+        position_error: (n, s) distance of the wrist from its target [m].
+        angle_error: (n, s) angle of the wrist from its target [rad].
+        solved: (n, s) both errors are within the tolerances.
+        cost: (n, s) distance from the start posture [rad] plus penalties near limits and singularities.
+    """
+
+    q: Float[Tensor, "n s dof"]
+    position_error: Float[Tensor, "n s"]
+    angle_error: Float[Tensor, "n s"]
+    solved: Bool[Tensor, "n s"]
+    cost: Float[Tensor, "n s"]
+
+
+class InverseKinematics:
+    """Arm postures for wrist poses given in the robot's base frame.
+
+    Args:
+        robot: whose chain from root to wrist is solved.
+        start: (dof,) posture [rad] that solutions should be near; the posture "home" by default.
+        seed: of the table of seeds; the same seed gives the same solutions.
+
+    Raises:
+        InputError: `start` has another number of joints than the arm.
+    """
+
+    def __init__(self, robot: RobotDescription, start: np.ndarray | None = None, seed: int = 0):
+        self.chain = SerialChain.of(robot)
+        home = robot.postures["home"].arm if start is None else start
+        if len(home) != len(robot.arm):
+            raise InputError(f"the start posture has {len(home)} joints; the arm of {robot.name!r} has {len(robot.arm)}")
+        self.start = torch.tensor(np.asarray(home), dtype=torch.float32)
+        self.lower, self.upper = self.chain.lower + LIMIT_MARGIN, self.chain.upper - LIMIT_MARGIN
+        first = robot.model.chain(robot.wrist_link)[0]
+        self._axis = torch.tensor(first.origin @ _frame_about(first.axis), dtype=torch.float32)
+        generator = torch.Generator().manual_seed(seed)
+        share = torch.rand(TABLE_SIZE, len(home), generator=generator)
+        self._table = self.lower + share * (self.upper - self.lower)
+        self._table[:, 0] = 0.0
+        position, rotation = self.chain.tip_pose(self._table)
+        features, self._azimuth = self._features(position, rotation)
+        self._keys = torch.cat([features, METRES_PER_JOINT_RADIAN * self._table[:, 1:]], -1)
+        self._identity = torch.eye(6)
+
+    def solve(
+        self,
+        position: Float[Tensor, "n 3"],
+        quaternion: Float[Tensor, "n 4"],
+        seeds: int = 4,
+        iterations: int = 24,
+    ) -> Solutions:
+        """Postures for wrist poses (m, wxyz) in the base frame, from `seeds` starts each.
+
+        A pose that is out of reach gives the posture where the iterations ended, not solved.
+        """
+        rotation = matrix_from_quaternion(quaternion)
+        q = self._seeds(position, rotation, seeds)
+        n, dof = len(position), q.shape[-1]
+        rows = [x.repeat_interleave(seeds, 0) for x in (position, rotation)]
+        q, error, manipulability = self._iterate(q.reshape(-1, dof), rows[0], rows[1], iterations)
+        away, turn = error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1)
+        solved = (away < POSITION_TOLERANCE) & (turn < ANGLE_TOLERANCE)
+        cost = self._cost(q, manipulability)
+        order = torch.where(solved, cost, LAST + away + turn).reshape(n, seeds).argsort(dim=-1, stable=True)
+        flat = (order + seeds * torch.arange(n)[:, None]).reshape(-1)
+        return Solutions(
+            q[flat].reshape(n, seeds, dof),
+            *(x[flat].reshape(n, seeds) for x in (away, turn, solved, cost)),
+        )
+
+    def follow(
+        self,
+        q: Float[Tensor, "n dof"],
+        position: Float[Tensor, "n k 3"],
+        quaternion: Float[Tensor, "n k 4"],
+        iterations: int = 4,
+    ) -> tuple[Float[Tensor, "n k dof"], Bool[Tensor, "n k"]]:
+        """Tracks k wrist poses in turn, each from the posture of the one before, the first from `q`.
+
+        Returns the postures [rad] and whether each is within the tolerances.
+        """
+        rotation = matrix_from_quaternion(quaternion)
+        postures, solved = [], []
+        for place, turn in zip(position.unbind(1), rotation.unbind(1), strict=True):
+            q, error, _ = self._iterate(q, place, turn, iterations, pulled=0)
+            postures.append(q)
+            solved.append(
+                (error[:, :3].norm(dim=-1) < POSITION_TOLERANCE) & (error[:, 3:].norm(dim=-1) < ANGLE_TOLERANCE)
+            )
+        return torch.stack(postures, 1), torch.stack(solved, 1)
+
+    def _features(self, position: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+        """Pose turned about the first joint's axis to azimuth zero, as a vector, and the azimuth [rad]."""
+        turn, origin = self._axis[:3, :3], self._axis[:3, 3]
+        local = (position - origin) @ turn
+        azimuth = torch.atan2(local[:, 1], local[:, 0])
+        c, s, zero = azimuth.cos(), azimuth.sin(), torch.zeros_like(azimuth)
+        back = torch.stack([c, s, zero, -s, c, zero, zero, zero, zero + 1], -1).unflatten(-1, (3, 3))
+        turned = back @ (turn.T @ rotation)
+        radius = local[:, :2].norm(dim=-1, keepdim=True)
+        # |R - R'|^2 = 2 angle^2 for small angles
+        return torch.cat([radius, local[:, 2:], METRES_PER_RADIAN * 0.5**0.5 * turned.flatten(1)], -1), azimuth
+
+    def _seeds(self, position: Tensor, rotation: Tensor, count: int) -> Tensor:
+        """(n, count, dof) postures of the table: the nearest of each of `count` parts of it."""
+        features, azimuth = self._features(position, rotation)
+        rest = METRES_PER_JOINT_RADIAN * self.start[1:].expand(len(features), -1)
+        queries = torch.cat([features, rest], -1)
+        parts = self._keys[: TABLE_SIZE // count * count].unflatten(0, (count, -1))
+        half = 0.5 * parts.square().sum(-1)[:, None]
+        found = []
+        for query in queries.split(CHUNK):
+            found.append(torch.baddbmm(half, query.expand(count, -1, -1), parts.transpose(1, 2), alpha=-1).argmin(-1))
+        index = torch.cat(found, 1).T + parts.shape[1] * torch.arange(count)
+        q = self._table[index]
+        turn = azimuth[:, None] - self._azimuth[index]
+        q[..., 0] = torch.remainder(turn + torch.pi, 2 * torch.pi) - torch.pi
+        return q.clamp(self.lower, self.upper)
+
+    def _iterate(
+        self, q: Tensor, position: Tensor, rotation: Tensor, iterations: int, pulled: int = PULLED
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Damped steps until all rows are within half the tolerances; (q, error (n, 6), manipulability (n,))."""
+        out, left = q.clone(), torch.arange(len(q))
+        final, manipulability = q.new_empty(len(q), 6), q.new_empty(len(q))
+        for i in range(iterations + 1):
+            frames = self.chain.forward(q)
+            error = pose_error(frames, position, rotation)
+            done = (error[:, :3].norm(dim=-1) < POSITION_TOLERANCE / 2) & (
+                error[:, 3:].norm(dim=-1) < ANGLE_TOLERANCE / 2
+            )
+            done |= i == iterations
+            jacobian = self.chain.jacobian_of(frames)
+            if done.any():
+                rows = left[done]
+                out[rows], final[rows] = q[done], error[done]
+                product = jacobian[done] @ jacobian[done].transpose(1, 2)
+                manipulability[rows] = torch.linalg.det(product).clamp_min(0).sqrt()
+                keep = ~done
+                if not keep.any():
+                    break
+                q, error, jacobian, left = q[keep], error[keep], jacobian[keep], left[keep]
+                position, rotation = position[keep], rotation[keep]
+            q = self._step(q, error, jacobian, PULL if i < pulled else 0.0)
+        return out, final, manipulability
+
+    def _step(self, q: Tensor, error: Tensor, jacobian: Tensor, pull: float) -> Tensor:
+        gradient = (error.unsqueeze(-2) @ jacobian).squeeze(-2)
+        stuck = ((q >= self.upper) & (gradient > 0)) | ((q <= self.lower) & (gradient < 0))
+        jacobian = jacobian * ~stuck[:, None]
+        damping = DAMPING_FLOOR + DAMPING_GAIN * error.square().sum(-1)
+        goal = error.unsqueeze(-1)
+        rest = pull * (self.start - q)
+        rest[:, 0] = 0.0  # the azimuth decides it
+        if pull:
+            goal = goal - jacobian @ rest.unsqueeze(-1)
+        transposed = jacobian.transpose(1, 2)
+        product = torch.baddbmm(damping[:, None, None] * self._identity, jacobian, transposed)
+        factor, _ = torch.linalg.cholesky_ex(product)
+        step = (transposed @ torch.cholesky_solve(goal, factor)).squeeze(-1) + rest
+        step = step / (step.abs().amax(-1, keepdim=True) / LARGEST_STEP).clamp_min(1.0)
+        return torch.clamp(q + step, self.lower, self.upper)
+
+    def _cost(self, q: Tensor, manipulability: Tensor) -> Tensor:
+        margin = torch.minimum(q - self.lower, self.upper - q).amin(-1)
+        return (
+            (q - self.start).norm(dim=-1)
+            + MARGIN_COST * torch.exp(-margin / MARGIN_SCALE)
+            + MANIPULABILITY_COST * torch.exp(-manipulability / MANIPULABILITY_SCALE)
+        )
+
+
+def pose_error(
+    frames: Frames, position: Float[Tensor, "n 3"], rotation: Float[Tensor, "n 3 3"]
+) -> Float[Tensor, "n 6"]:
+    """Displacement [m] and rotation vector [rad], in the base frame, from the tip to the target."""
+    tip = frames.tip
+    turn = rotation @ tip[:, :3, :3].transpose(1, 2)
+    skew = 0.5 * torch.stack(
+        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], -1
+    )
+    cosine = 0.5 * (turn.diagonal(dim1=1, dim2=2).sum(-1, keepdim=True) - 1)
+    sine = skew.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    return torch.cat([position - tip[:, :3, 3], skew * (torch.atan2(sine, cosine) / sine)], -1)
+
+
+def _frame_about(axis: np.ndarray) -> np.ndarray:
+    """A pose (4, 4) at the origin whose z axis is `axis`."""
+    z = axis / np.linalg.norm(axis)
+    x = np.eye(3)[np.abs(z).argmin()]
+    x = x - z * (x @ z)
+    x /= np.linalg.norm(x)
+    out = np.eye(4)
+    out[:3, :3] = np.stack([x, np.cross(z, x), z], -1)
+    return out

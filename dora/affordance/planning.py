@@ -1,0 +1,170 @@
+"""Collision-free arm motions: RRT-Connect of OMPL over the collision model, shortened, smoothed and timed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from dora.affordance.collision import CollisionModel, need
+from dora.errors import InputError
+
+RESOLUTION = 0.02
+"""Distance in joint space between two postures that are checked while planning [rad]."""
+FINE_RESOLUTION = 0.005
+"""The same for the finished path [rad]."""
+RANGE = 0.8
+"""Longest edge that the planner adds to its trees [rad]."""
+EDGE_LIMIT = 0.05
+"""Longest distance between two way points of the returned path [rad]."""
+SMOOTHING_STEPS = 3
+"""Subdivisions of the B-spline that rounds off corners."""
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """How hard to search.
+
+    Attributes:
+        checks: how often the planner may ask whether to go on; about the number of nodes it tries.
+        attempts: independent searches, each with its own seed and a finer resolution.
+        seed: the same seed gives the same path.
+    """
+
+    checks: int = 400
+    attempts: int = 2
+    seed: int = 0
+
+
+def plan(
+    model: CollisionModel,
+    start: Float[np.ndarray, " dof"],
+    goal: Float[np.ndarray, " dof"],
+    hand: Float[np.ndarray, " h"],
+    settings: PlanSettings | None = None,
+) -> Float[np.ndarray, "k dof"] | None:
+    """A path of arm postures [rad] from `start` to `goal` on which nothing touches.
+
+    The straight line in joint space is taken where it is free, so most paths cost no search.
+
+    Args:
+        model: what must not touch; its object is where `place_object` put it.
+        start: arm joints [rad].
+        goal: arm joints [rad].
+        hand: hand joints [rad], held during the motion.
+        settings: effort and seed.
+
+    Returns:
+        k way points at most EDGE_LIMIT apart, within the joint limits and free at FINE_RESOLUTION; None if there is
+        none, in particular where `start` or `goal` touch something.
+
+    Raises:
+        InputError: OMPL is not installed, or `start` or `goal` is outside the joint limits.
+    """
+    settings = settings or PlanSettings()
+    arm = model.robot.arm
+    for name, q in (("start", start), ("goal", goal)):
+        if not ((q >= arm.lower) & (q <= arm.upper)).all():
+            raise InputError(f"the {name} of the motion is outside the joint limits of {model.robot.name!r}; move it inside")
+    if not model.free(np.stack([start, goal]), hand):
+        return None
+    straight = densified(np.stack([start, goal]), EDGE_LIMIT)
+    if model.free(densified(straight, FINE_RESOLUTION), hand):
+        return straight
+    for attempt in range(settings.attempts):
+        path = _search(model, start, goal, hand, settings.seed + attempt, RESOLUTION / 2**attempt, settings.checks)
+        if path is not None and model.free(densified(path, FINE_RESOLUTION), hand):
+            return densified(path, EDGE_LIMIT)
+    return None
+
+
+def densified(path: Float[np.ndarray, "k dof"], spacing: float) -> Float[np.ndarray, "m dof"]:
+    """The same polygon with points at most `spacing` apart (Euclidean, in the path's unit)."""
+    counts = np.maximum(1, np.ceil(np.linalg.norm(np.diff(path, axis=0), axis=1) / spacing)).astype(int)
+    pieces = [
+        a + (b - a) * np.arange(n)[:, None] / n for a, b, n in zip(path[:-1], path[1:], counts, strict=True)
+    ]
+    return np.concatenate([*pieces, path[-1:]])
+
+
+def timed(
+    path: Float[np.ndarray, "k dof"],
+    velocity: Float[np.ndarray, " dof"],
+    period: float,
+    ramp: float = 0.3,
+) -> Float[np.ndarray, "m dof"]:
+    """Postures at multiples of `period` [s] along a path, from rest to rest.
+
+    At full speed the joint that is slowest on an edge moves at its limit; speed rises to that linearly in `ramp`
+    seconds, and falls likewise at the end.
+
+    Args:
+        path: way points [rad].
+        velocity: limits [rad/s], more than 0.
+        period: of the control steps [s].
+        ramp: time from rest to full speed [s].
+
+    Returns:
+        m postures [rad], the first and last of the path included; no step exceeds velocity * period.
+    """
+    edges = (np.abs(np.diff(path, axis=0)) / velocity).max(1)
+    clock = np.concatenate([[0.0], np.cumsum(edges)])
+    ramp = max(min(ramp, clock[-1]), 1e-9)
+    total = clock[-1] + ramp
+    t = np.minimum(np.arange(int(np.ceil(total / period)) + 1) * period, total)
+    rising, falling = np.minimum(t, ramp), np.maximum(t - (total - ramp), 0.0)
+    travelled = rising**2 / (2 * ramp) + np.clip(t - ramp, 0.0, total - 2 * ramp) + falling - falling**2 / (2 * ramp)
+    return np.stack([np.interp(travelled, clock, joint) for joint in path.T], 1)
+
+
+def _search(
+    model: CollisionModel,
+    start: np.ndarray,
+    goal: np.ndarray,
+    hand: np.ndarray,
+    seed: int,
+    resolution: float,
+    checks: int,
+) -> np.ndarray | None:
+    """One run of RRT-Connect with shortening and smoothing; None if it finds nothing."""
+    base, geometric, util = need("ompl.base", "ompl"), need("ompl.geometric", "ompl"), need("ompl.util", "ompl")
+    util.setLogLevel(util.LOG_NONE)
+    util.RNG.setSeed(seed + 1)  # 0 would draw a random one
+    arm, dof = model.robot.arm, len(start)
+    space = base.RealVectorStateSpace(dof)
+    bounds = base.RealVectorBounds(dof)
+    for i in range(dof):
+        bounds.setLow(i, float(arm.lower[i]))
+        bounds.setHigh(i, float(arm.upper[i]))
+    space.setBounds(bounds)
+    setup = geometric.SimpleSetup(space)
+    setup.setStateValidityChecker(lambda state: model.free(_array(state, dof)[None], hand))
+    information = setup.getSpaceInformation()
+    space.setLongestValidSegmentFraction(resolution / space.getMaximumExtent())
+    planner = geometric.RRTConnect(information)
+    planner.setRange(RANGE)
+    setup.setPlanner(planner)
+    setup.setStartAndGoalStates(_state(space, start), _state(space, goal))
+    asked = iter(range(checks))
+    setup.solve(base.PlannerTerminationCondition(lambda: next(asked, None) is None))
+    if not setup.haveExactSolutionPath():
+        return None
+    path = setup.getSolutionPath()
+    simplifier = geometric.PathSimplifier(information)
+    simplifier.reduceVertices(path)
+    simplifier.partialShortcutPath(path)
+    simplifier.smoothBSpline(path, SMOOTHING_STEPS)
+    return np.stack([_array(state, dof) for state in path.getStates()])
+
+
+def _array(state: Any, dof: int) -> np.ndarray:
+    return np.array([state[i] for i in range(dof)])
+
+
+def _state(space: Any, q: np.ndarray) -> Any:
+    state = space.allocState()
+    for i, value in enumerate(q):
+        state[i] = float(value)
+    return state

@@ -1,0 +1,105 @@
+"""Files that are either old or new, never half written, and safetensors that notice damage."""
+
+import csv
+import hashlib
+import io
+import json
+import os
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from dora.errors import InputError
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Replace `path` by `content`: write beside it, flush to the disk, rename.
+
+    Raises:
+        InputError: if the disk is full or the folder cannot be written; `path` is as it was.
+    """
+    temporary = None
+    try:
+        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+        temporary = None
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+    except OSError as error:
+        raise InputError(
+            f"Cannot write {path} ({error.strerror or error}): the previous file is kept; "
+            "free some space or choose another folder."
+        ) from error
+    finally:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Replace `path` by a JSON object."""
+    write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Replace `path` by a table."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in rows)
+    write_bytes(path, text.getvalue().encode())
+
+
+def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
+    """Replace `path` by a safetensors file of the format `kind` (name and version, such as "dora-grasps 1").
+
+    `metadata` is anything that JSON can hold; `read_tensors` gives it back.
+    """
+    own = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    text = json.dumps(dict(metadata))
+    write_bytes(path, save(own, {"format": kind, "metadata": text, "sha256": tensor_digest(own, text)}))
+
+
+def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and metadata of a file written by `write_tensors`.
+
+    Raises:
+        InputError: if it is missing, truncated, damaged, or of another format or version than `kind`.
+    """
+    if not path.is_file():
+        raise InputError(f"There is no file {path}: give the path of a {kind} file (.safetensors).")
+    try:
+        with safe_open(path, framework="pt") as stream:
+            header = stream.metadata() or {}
+            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path} is truncated, damaged or no {kind} file ({error}): make it again.") from error
+    if header.get("format") != kind:
+        found = header.get("format", "another format")
+        raise InputError(f"{path} is {found}, not {kind}: give a {kind} file, or make it again with this version.")
+    if header.get("sha256") != tensor_digest(tensors, header.get("metadata", "")):
+        raise InputError(f"{path} is damaged (its digest differs): make it again.")
+    return tensors, json.loads(header["metadata"])
+
+
+def tensor_digest(tensors: Mapping[str, Tensor], text: str = "") -> str:
+    """sha256 over names, types, shapes and values of CPU tensors, and over `text`."""
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(tensors):
+        value = tensors[name]
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()

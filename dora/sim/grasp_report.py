@@ -1,0 +1,73 @@
+"""The table of a grasp search, and the two files that it leaves."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from dora.affordance.candidates import GraspCandidates
+from dora.errors import InputError
+from dora.files import write_json
+
+SUFFIX = ".safetensors"
+ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "candidates": lambda r: f"{r['optimised']} of {r['requested']}",
+    "search": lambda r: f"{r['optimise_seconds']:.1f} s",
+    "simulation": lambda r: f"{r['validate_seconds']:.1f} s",
+    "passed the simulation": lambda r: _percent(r["sim_success_rate"]),
+    "valid": lambda r: f"{r['valid']} ({_percent(r['valid_share'])})",
+    "strictly valid": lambda r: _percent(r["strict_share"]),
+    "valid per second": lambda r: f"{r['valid_per_second']:.1f}",
+    "penetration, median / p90 / max": lambda r: _lengths(r["penetration_mm"]),
+    "self-penetration, median / p90 / max": lambda r: _lengths(r["self_penetration_mm"]),
+    "classes of the valid": lambda r: ", ".join(f"{n} {c}" for n, c in r["classes"].items()) or "-",
+    "energy, medians": lambda r: ", ".join(f"{n} {v:.3g}" for n, v in r["energy"].items()),
+}
+"""Rows of the printed table."""
+
+
+def print_report(report: dict[str, Any], console: Console | None = None) -> None:
+    """Print a summary and, beside it, the baselines that it holds under "baselines"."""
+    baselines = report.get("baselines", {})
+    table = Table(title=f"{report['object']}, {report['region'] or 'any region'}, {report['robot']}")
+    table.add_column()
+    for name in ("grasps", *baselines):
+        table.add_column(name.replace("_", " "), overflow="fold")
+    for name, cell in ROWS.items():
+        table.add_row(name, *(cell(column) for column in (report, *baselines.values())))
+    (console or Console()).print(table)
+
+
+def check_out(out: Path) -> None:
+    """Make the folder of a file of grasps, so that bad paths are refused before the work.
+
+    Raises:
+        InputError: it does not end in .safetensors, or it cannot be written.
+    """
+    if out.suffix != SUFFIX:
+        raise InputError(f"--out is {out}: give a name that ends in {SUFFIX}.")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"Cannot make the folder {out.parent} ({error.strerror}): choose another --out.") from error
+    if not os.access(out.parent, os.W_OK) or out.is_dir():
+        raise InputError(f"Cannot write {out}: choose another --out.")
+
+
+def write_report(report: dict[str, Any], candidates: GraspCandidates, out: Path) -> None:
+    """Write the candidates to `out` and the report beside it as .json, each atomically."""
+    candidates.save(out)
+    write_json(out.with_suffix(".json"), report)
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.0f} %"
+
+
+def _lengths(spread: dict[str, float]) -> str:
+    return " / ".join(f"{spread[name]:.2f}" for name in ("median", "p90", "max")) + " mm"

@@ -1,0 +1,70 @@
+"""How a hand grips an object: contacts of one physics step between the parts of a hand and one body."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Grip:
+    """Contact points of k touching pairs of shapes, world frame.
+
+    Attributes:
+        part: (k,) hand part of each point.
+        force: (k,) magnitude of the impulse over the length of the step [N].
+        point: (k, 3) [m].
+        depth: deepest overlap over all points [m]; 0 if none overlap.
+    """
+
+    part: np.ndarray
+    force: np.ndarray
+    point: np.ndarray
+    depth: float
+
+    @property
+    def held(self) -> bool:
+        """Whether any point carries a force."""
+        return bool((self.force > 0).any())
+
+    def by_part(self, parts: int) -> np.ndarray:
+        """Sum of the magnitudes per hand part, (parts,) [N]."""
+        return np.bincount(self.part, self.force, parts)
+
+
+class GripReader:
+    """Reads the contacts between one body and a hand.
+
+    Args:
+        contacts: returns PhysX's contacts of the last step.
+        body: the body that may be gripped.
+        part_of: hand part by `id` of a link's body.
+        timestep: length of a physics step [s].
+    """
+
+    def __init__(
+        self, contacts: Callable[[], list], body: Any, part_of: Mapping[int, int], timestep: float
+    ):
+        self._contacts, self._body, self._part_of, self._timestep = contacts, body, part_of, timestep
+
+    def read(self) -> Grip:
+        """Contacts of the last step; points that PhysX only watches carry no force."""
+        part, impulse, point, depth = [], [], [], 0.0
+        for contact in self._contacts():
+            first, second = contact.bodies
+            if first is self._body:
+                link = self._part_of.get(id(second))
+            elif second is self._body:
+                link = self._part_of.get(id(first))
+            else:
+                continue
+            if link is None:
+                continue
+            for p in contact.points:
+                depth = min(depth, p.separation)
+                part.append(link)
+                impulse.append(p.impulse)
+                point.append(p.position)
+        force = np.linalg.norm(np.reshape(impulse, (-1, 3)), axis=1) / self._timestep
+        return Grip(np.array(part, np.int64), force, np.reshape(point, (-1, 3)), -depth)

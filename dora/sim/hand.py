@@ -1,0 +1,166 @@
+"""A robot's hand without its arm: the palm is held in space, or moved in straight lines by a carriage."""
+
+import numpy as np
+import sapien
+from sapien import physx
+from sapien.wrapper.articulation_builder import ArticulationBuilder, LinkBuilder
+from sapien.wrapper.urdf_loader import URDFLoader
+
+from dora.robot import RobotDescription
+from dora.sim.shapes import collision_shape
+
+PALM, FIRST_FINGER = 0, 1
+"""Rows of the palm and of the first finger wherever hand parts are counted."""
+CARRIAGE_STIFFNESS = 2e4
+"""Drive of the carriage along each axis [N/m]; the grip of the arm's drives seen at the wrist."""
+CARRIAGE_DAMPING = 4e2
+"""[N s/m]"""
+CARRIAGE_FORCE = 200.0
+"""Largest force of the carriage along each axis [N]."""
+CARRIAGE_REACH = 2.0
+"""Travel to both sides [m]."""
+CARRIAGE_MASS = 0.5
+"""Mass of each slide [kg]."""
+
+
+class FloatingHand:
+    """The hand of a robot, joints in the order of its description; weightless.
+
+    Args:
+        scene: where the hand is built.
+        robot: whose hand it is.
+        friction: coefficient of all its links, instead of the description's.
+        iterations: position and velocity iterations of the solver.
+        carriage: whether the palm rides on three slides along the axes of the root's frame.
+
+    Attributes:
+        parts: number of hand parts: the palm, then the fingers in the description's order.
+        part_of: hand part by `id` of a link's body.
+    """
+
+    def __init__(
+        self,
+        scene: sapien.Scene,
+        robot: RobotDescription,
+        friction: float,
+        iterations: tuple[int, int],
+        carriage: bool = False,
+    ):
+        builder = _hand_builder(scene, robot)
+        if carriage:
+            _put_on_carriage(builder, robot.wrist_link)
+        entities = builder.build_entities(fix_root_link=True)
+        bodies = {e.name: e.find_component_by_type(physx.PhysxArticulationLinkComponent) for e in entities}
+        bits = robot.collision_bits()
+        for name, body in bodies.items():
+            for shape in robot.shapes.get(name, ()):
+                contact = robot.contacts[name]
+                made = collision_shape(shape, physx.PhysxMaterial(friction, friction, contact.restitution))
+                made.set_contact_offset(contact.contact_offset)
+                made.set_rest_offset(contact.rest_offset)
+                made.set_collision_groups([1, 1, bits[name], 0])
+                body.attach(made)
+            body.disable_gravity = True
+        for entity in entities:
+            scene.add_entity(entity)
+        self.articulation: physx.PhysxArticulation = bodies[robot.wrist_link].articulation
+        self.articulation.set_solver_position_iterations(iterations[0])
+        self.articulation.set_solver_velocity_iterations(iterations[1])
+        self._bodies = bodies  # kept alive: their ids are keys
+        self._name_parts(robot)
+        self._set_drives(robot)
+
+    def _name_parts(self, robot: RobotDescription) -> None:
+        self.parts = FIRST_FINGER + len(robot.fingers)
+        part_of = {name: PALM for name in self._bodies}
+        for number, finger in enumerate(robot.fingers.values(), FIRST_FINGER):
+            part_of |= dict.fromkeys(finger.links, number)
+        self.part_of = {id(body): part_of[name] for name, body in self._bodies.items()}
+
+    def _set_drives(self, robot: RobotDescription) -> None:
+        joints = {joint.name: joint for joint in self.articulation.active_joints}
+        self._order = [joint.name for joint in self.articulation.active_joints]
+        self._slides = [joints[name] for name in _SLIDES if name in joints]
+        for slide in self._slides:
+            slide.set_drive_properties(CARRIAGE_STIFFNESS, CARRIAGE_DAMPING, CARRIAGE_FORCE, "force")
+        self._joints = [joints[name] for name in robot.hand.names]
+        hand = robot.hand
+        for i, joint in enumerate(self._joints):
+            joint.set_drive_properties(hand.stiffness[i], hand.damping[i], hand.effort[i], "force")
+            joint.set_armature(np.array([hand.armature[i]], np.float32))
+        self._place = {name: i for i, name in enumerate(robot.hand.names)}
+
+    def reset(self, joints: np.ndarray, root: sapien.Pose | None = None) -> None:
+        """Puts the hand at rest: joints (20,) [rad], slides in the middle, the root's pose in the world."""
+        if root is not None:
+            self.articulation.set_root_pose(root)
+        values = [joints[self._place[name]] if name in self._place else 0.0 for name in self._order]
+        self.articulation.set_qpos(np.array(values, np.float32))
+        self.articulation.set_qvel(np.zeros(len(values), np.float32))
+        self.command(joints)
+        self.move([0.0] * len(self._slides))
+
+    def command(self, joints: np.ndarray) -> None:
+        """Sends the drives towards joints (20,) [rad]."""
+        for joint, angle in zip(self._joints, joints.tolist(), strict=True):
+            joint.set_drive_target(angle)
+
+    def move(self, offset: list[float]) -> None:
+        """Sends the slides towards an offset (3,) of the palm in the root's frame [m]."""
+        for slide, value in zip(self._slides, offset, strict=True):
+            slide.set_drive_target(value)
+
+    def slide_to(self, offset: list[float]) -> None:
+        """Puts the slides at an offset (3,) [m] at once, and leaves them there; the fingers stay as they are."""
+        qpos = self.articulation.qpos
+        for name, value in zip(_SLIDES, offset, strict=True):
+            qpos[self._order.index(name)] = value
+        self.articulation.set_qpos(qpos)
+        self.move(offset)
+
+
+_SLIDES = ("slide_x", "slide_y", "slide_z")
+_Z, _Y = (0.0, 0.0, 0.5**0.5), (0.0, 0.5**0.5, 0.0)
+_SLIDE_TURNS = ((1.0, 0.0, 0.0, 0.0), (0.5**0.5, *_Z), (0.5**0.5, 0.0, -(0.5**0.5), 0.0))
+"""Turns of the slides' frames (wxyz): a prismatic joint moves along its frame's x."""
+
+
+def _hand_builder(scene: sapien.Scene, robot: RobotDescription) -> ArticulationBuilder:
+    """Builder of the links from the wrist outwards, with their inertia, without shapes."""
+    loader = URDFLoader()
+    loader.set_scene(scene)
+    builder = loader.parse(str(robot.urdf))[0][0]
+    frames = {finger.tip for finger in robot.fingers.values()}
+    kept: list[LinkBuilder] = []
+    for link in builder.link_builders:
+        if link.name == robot.wrist_link or link.parent in kept:
+            kept.append(link)
+    kept = [link for link in kept if link.name not in frames]
+    for index, link in enumerate(kept):
+        link.index, link.collision_records, link.visual_records = index, [], []
+    kept[0].parent = None
+    kept[0].set_joint_name("")
+    kept[0].set_joint_properties("fixed", [], sapien.Pose(), sapien.Pose())
+    builder.link_builders = kept
+    return builder
+
+
+def _put_on_carriage(builder: ArticulationBuilder, palm: str) -> None:
+    """Three slides before the palm."""
+    hand, parent = builder.link_builders, None
+    builder.link_builders = []
+    for name in ("rail", *_SLIDES[:2]):
+        link = LinkBuilder(len(builder.link_builders), parent)
+        link.set_name(name.replace("slide", "carriage"))
+        link.set_mass_and_inertia(CARRIAGE_MASS, sapien.Pose(), [1e-3] * 3)
+        builder.link_builders.append(link)
+        parent = link
+    builder.link_builders += hand
+    for index, link in enumerate(builder.link_builders):
+        link.index = index
+    hand[0].parent = parent
+    limits = [[-CARRIAGE_REACH, CARRIAGE_REACH]]
+    for name, turn, link in zip(_SLIDES, _SLIDE_TURNS, builder.link_builders[1:4], strict=True):
+        link.set_joint_name(name)
+        link.set_joint_properties("prismatic", limits, sapien.Pose(q=turn), sapien.Pose(q=turn))
+    builder.link_builders[0].set_joint_properties("fixed", [], sapien.Pose(), sapien.Pose())

@@ -1,0 +1,154 @@
+"""Objects with affordances as bodies of a simulation: convex pieces to collide, the mesh to look at."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import sapien
+import trimesh
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.utils.building.actor_builder import ActorBuilder
+from mani_skill.utils.structs import Actor, Pose
+from sapien import physx
+
+from dora.affordance.structure import AffordanceObject
+from dora.errors import InputError
+from dora.sim.shapes import collision_shape
+
+CONTACT_OFFSET = 0.005
+"""Distance at which PhysX begins to look for contacts with an object [m]."""
+ROUGHNESS = 0.5
+COLOURS = (
+    (0.30, 0.47, 0.66, 1.0), (0.95, 0.56, 0.17, 1.0), (0.35, 0.63, 0.31, 1.0), (0.88, 0.34, 0.35, 1.0),
+    (0.46, 0.72, 0.70, 1.0), (0.93, 0.79, 0.28, 1.0), (0.69, 0.48, 0.63, 1.0), (0.61, 0.46, 0.37, 1.0),
+)  # fmt: skip
+"""Colours (RGBA) of an object's regions in the order of its labels, repeated if there are more."""
+
+
+def object_entity(
+    obj: AffordanceObject,
+    scale: float = 1.0,
+    friction: float = 0.7,
+    mass: float | None = None,
+    contact_offset: float = CONTACT_OFFSET,
+    visible: bool = False,
+) -> sapien.Entity:
+    """A dynamic body that is in no scene yet. Its frame is the object frame.
+
+    Mass, centre of mass and inertia are the object's, whatever its pieces overlap or leave out. Every piece has a
+    material of its own, so that friction can be changed for this body alone; shape i of the body is piece i.
+
+    Args:
+        obj: the object.
+        scale: factor of all lengths; mass does not follow it.
+        friction: coefficient, static and dynamic.
+        mass: mass [kg]; the object's own if None.
+        contact_offset: distance at which PhysX begins to look for contacts [m].
+        visible: whether the mesh is drawn, region by region; needs a renderer.
+
+    Raises:
+        InputError: a number is not positive, or a piece is no convex body.
+    """
+    kilograms = obj.mass if mass is None else mass
+    for name, value in (("scale", scale), ("mass", kilograms), ("friction", friction)):
+        if not value > 0:
+            raise InputError(f"{obj.name}: {name} is {value}; it must be positive.")
+    entity = sapien.Entity()
+    entity.name = obj.name
+    body = physx.PhysxRigidDynamicComponent()
+    for index, piece in enumerate(obj.pieces):
+        try:
+            shape = collision_shape(piece.shape, physx.PhysxMaterial(friction, friction, 0.0), scale)
+        except RuntimeError as error:
+            raise InputError(f"{obj.name}: piece {index} ({piece.label}) is no convex body; decompose it.") from error
+        shape.set_contact_offset(contact_offset)
+        body.attach(shape)
+    moments, axes = np.linalg.eigh(obj.inertia * (kilograms / obj.mass * scale**2))
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    turn = np.eye(4)
+    turn[:3, :3] = axes
+    body.mass = kilograms
+    body.cmass_local_pose = sapien.Pose(turn)
+    body.inertia = moments
+    entity.add_component(body)
+    if visible:
+        entity.add_component(_visual(obj, scale))
+    return entity
+
+
+def _visual(obj: AffordanceObject, scale: float) -> sapien.render.RenderBodyComponent:
+    """The mesh, one shape per region."""
+    component = sapien.render.RenderBodyComponent()
+    for index, label in enumerate(obj.labels):
+        part: trimesh.Trimesh = obj.region(label)
+        corners = np.asarray(part.triangles.reshape(-1, 3) * scale, np.float32)
+        shape = sapien.render.RenderShapeTriangleMesh(
+            vertices=corners,
+            triangles=np.arange(len(corners), dtype=np.uint32).reshape(-1, 3),
+            normals=np.repeat(part.face_normals, 3, axis=0).astype(np.float32),
+            uvs=np.zeros((len(corners), 2), np.float32),
+            material=sapien.render.RenderMaterial(base_color=list(COLOURS[index % len(COLOURS)]), roughness=ROUGHNESS),
+        )
+        shape.name = label
+        component.attach(shape)
+    return component
+
+
+class ObjectBuilder(ActorBuilder):
+    """ManiSkill's actor builder for an object; arguments as for `object_entity`, `visible` by what can render."""
+
+    def __init__(self, scene: ManiSkillScene, obj: AffordanceObject, **settings: float | None):
+        super().__init__()
+        self.set_scene(scene)
+        self._object, self._settings = obj, settings
+
+    def build_entity(self) -> sapien.Entity:
+        """A body for one environment."""
+        return object_entity(self._object, visible=self.scene.can_render(), **self._settings)  # pyright: ignore
+
+
+def build_object(
+    scene: ManiSkillScene,
+    obj: AffordanceObject,
+    name: str | None = None,
+    pose: sapien.Pose | None = None,
+    scale: float | Sequence[float] | np.ndarray = 1.0,
+    friction: float = 0.7,
+    mass: float | None = None,
+    contact_offset: float = CONTACT_OFFSET,
+) -> Actor:
+    """The object in every environment of a ManiSkill scene.
+
+    Args:
+        scene: where.
+        obj: what.
+        name: name of the actor, the object's by default.
+        pose: where it is first; at rest on a table of height 0 under the origin by default.
+        scale: factor of all lengths, one for all environments or one for each.
+        friction: coefficient, static and dynamic.
+        mass: mass [kg]; the object's own if None.
+        contact_offset: as in `object_entity`.
+
+    Returns:
+        One actor; with a scale per environment it is merged from one per environment.
+
+    Raises:
+        InputError: as in `object_entity`, or the scales are not as many as environments.
+    """
+    name = obj.name if name is None else name
+    factors = np.broadcast_to(np.asarray(scale, float), (scene.num_envs,) if np.ndim(scale) == 0 else np.shape(scale))
+    if factors.shape != (scene.num_envs,):
+        raise InputError(f"{name}: {factors.size} scales for {scene.num_envs} environments; give one for each.")
+    parts = []
+    shared = np.ndim(scale) == 0
+    for i, factor in enumerate(factors[:1].tolist() if shared else factors.tolist()):
+        builder = ObjectBuilder(scene, obj, scale=factor, friction=friction, mass=mass, contact_offset=contact_offset)
+        builder.initial_pose = Pose.create(pose or sapien.Pose([0.0, 0.0, factor * obj.support], obj.rest))
+        if shared:
+            return builder.build(name)
+        builder.set_scene_idxs([i])
+        part = builder.build(f"{name}-{i}")
+        scene.remove_from_state_dict_registry(part)
+        parts.append(part)
+    merged = Actor.merge(parts, name)
+    scene.add_to_state_dict_registry(merged)
+    return merged

@@ -1,0 +1,115 @@
+"""Which candidates an episode works with: reachable, well ranked, near; imperfect as the preset says."""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dora.affordance.candidates import GraspCandidates
+from dora.robot.rotations import (
+    quaternion_apply,
+    quaternion_from_rotation_vector,
+    quaternion_multiply,
+    rotation_angle,
+)
+from dora.tasks.presets import Preset
+
+NEAREST = 3
+"""Candidates that an environment observes; the first one leads the reference."""
+ROTATION_WEIGHT = 0.1
+"""Metres that one radian counts when candidates are compared [m/rad]."""
+SCORE_MARGIN = 0.1
+"""Candidates whose score is at most this much below the best reachable one's count as well ranked."""
+UNRANKED, UNREACHABLE = 1e3, 1e6
+"""Distances added to candidates that are ranked lower or cannot be reached [m]; larger than any real one."""
+ERROR_DRAWS = 26
+"""Random numbers of the candidates' error: 3 position, 3 rotation, 20 joints."""
+
+
+class Choice:
+    """The candidates in use, one row per environment; poses in the object frame, the error included.
+
+    All k candidates of an environment have the same error, as a misplaced object frame would cause.
+
+    Attributes:
+        error_scale: share of the preset's candidate error in force, for curricula.
+        buffers: `position` (n, k, 3) [m], `quaternion` (n, k, 4), of the k nearest; of the first one `approach`
+            (n, 3), `pregrasp` and `grasp` (n, 20) [rad]; `reachable` (n,), 0 where no candidate can be reached.
+    """
+
+    def __init__(self, candidates: GraspCandidates, num_envs: int, device: torch.device):
+        self.candidates = candidates.to(device)
+        self._score = torch.nan_to_num(self.candidates.score, nan=0.0)
+        self.error_scale = 1.0
+
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(num_envs, *shape, device=device)
+
+        self.buffers = {
+            "position": zeros(NEAREST, 3), "quaternion": zeros(NEAREST, 4), "approach": zeros(3),
+            "pregrasp": zeros(20), "grasp": zeros(20), "reachable": zeros(),
+        }  # fmt: skip
+        self.buffers["quaternion"][..., 0] = 1.0
+
+    def nearest(
+        self,
+        object_p: Float[Tensor, "b 3"],
+        object_q: Float[Tensor, "b 4"],
+        wrist_p: Float[Tensor, "b 3"],
+        wrist_q: Float[Tensor, "b 4"],
+        reachable: Bool[Tensor, "b c"],
+    ) -> Int[Tensor, "b k"]:
+        """Indices of the k best candidates: reachable before unreachable, well ranked before lower ones, then by
+        distance from the wrist. With fewer than k reachable ones, the first is repeated."""
+        c, b, count = self.candidates, len(object_p), len(self.candidates)
+        each = object_q[:, None].expand(b, count, 4)
+        goal_p = object_p[:, None] + quaternion_apply(each, c.position.expand(b, count, 3))
+        goal_q = quaternion_multiply(each, c.quaternion.expand(b, count, 4))
+        away = (goal_p - wrist_p[:, None]).norm(dim=-1)
+        turn = rotation_angle(goal_q, wrist_q[:, None].expand(b, count, 4))
+        score = torch.where(reachable, self._score, -1.0)
+        well_ranked = score >= score.amax(-1, keepdim=True) - SCORE_MARGIN
+        cost = away + ROTATION_WEIGHT * turn + UNRANKED * ~well_ranked + UNREACHABLE * ~reachable
+        best = cost.topk(min(NEAREST, count), largest=False)
+        index = torch.where(best.values < UNREACHABLE, best.indices, best.indices[:, :1])
+        return torch.cat([index, index[:, :1].expand(b, NEAREST - index.shape[1])], -1)
+
+    def choose(
+        self, rows: Int[Tensor, " b"], index: Int[Tensor, "b k"], reachable: Bool[Tensor, " b"],
+        error: Float[Tensor, "b 26"], preset: Preset,
+    ) -> None:  # fmt: skip
+        """Gives the environments `rows` the candidates `index`, with the preset's error.
+
+        `error` are independent uniform numbers in [-1, 1]: 3 for position, 3 for rotation, 20 for the joints;
+        `reachable` says whether the first candidate can be reached.
+        """
+        c, first, error = self.candidates, index[:, 0], self.error_scale * error
+        tilt = quaternion_from_rotation_vector(preset.candidate_rotation * error[:, 3:6])
+        bend = preset.candidate_joint * error[:, 6:]
+        values = {
+            "position": c.position[index] + preset.candidate_position * error[:, None, :3],
+            "quaternion": quaternion_multiply(c.quaternion[index], tilt[:, None].expand(-1, NEAREST, 4)),
+            "approach": c.approach[first],
+            "pregrasp": c.pregrasp[first] + bend,
+            "grasp": c.grasp[first] + bend,
+            "reachable": reachable.float(),
+        }
+        for name, buffer in self.buffers.items():
+            buffer[rows] = values[name]
+
+    def goals(
+        self, object_p: Float[Tensor, "n 3"], object_q: Float[Tensor, "n 4"]
+    ) -> tuple[Float[Tensor, "n k 3"], Float[Tensor, "n k 4"], Float[Tensor, "n 3"]]:
+        """World wrist positions and orientations that the candidates ask for at the objects' poses, and the
+        direction of the first one's approach."""
+        b, each = self.buffers, object_q[:, None].expand(-1, NEAREST, 4)
+        position = object_p[:, None] + quaternion_apply(each, b["position"])
+        return position, quaternion_multiply(each, b["quaternion"]), quaternion_apply(object_q, b["approach"])
+
+    def get_state(self) -> dict[str, Tensor]:
+        """Copies of all buffers by name."""
+        return {name: buffer.clone() for name, buffer in self.buffers.items()}
+
+    def set_state(self, state: dict[str, Tensor], rows: Tensor | slice) -> None:
+        """Inverse of `get_state` for the given rows."""
+        for name, buffer in self.buffers.items():
+            buffer[rows] = state[name].reshape(buffer[rows].shape)

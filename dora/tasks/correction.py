@@ -1,0 +1,107 @@
+"""The action as a bounded, low-passed correction of a reference, in the hand frame; the same for every reference.
+
+    x_target = x_reference * exp(bound * c),    c <- c + SMOOTHING (a - c)
+
+so that a = 0 executes the reference and the policy only has to learn what the reference gets wrong. The first-order
+low-pass keeps exploration noise from shaking the fingers; c is part of the observation.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dora.errors import InputError
+from dora.robot.rotations import (
+    quaternion_apply,
+    quaternion_from_rotation_vector,
+    quaternion_inverse,
+    quaternion_multiply,
+    rotation_vector_from_quaternion,
+)
+
+SMOOTHING = 0.3
+"""Share of the new action in the low-passed correction."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Largest corrections: of the wrist along each axis [m], about each axis [rad], of a hand joint [rad]."""
+
+    position: float = 0.03
+    rotation: float = 0.2
+    joint: float = 0.3
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where a reference sends the wrist (world pose, n rows) and the hand joints [rad]."""
+
+    wrist_p: Float[Tensor, "n 3"]
+    wrist_q: Float[Tensor, "n 4"]
+    hand: Float[Tensor, "n 20"]
+
+
+class Correction:
+    """Per-environment correction in units of the bounds.
+
+    Attributes:
+        bounds: largest corrections at scale 1.
+        scale: share of the bounds in force, for curricula.
+        value: low-passed correction (n, a) in [-1, 1]: 3 translation, 3 rotation vector, then the hand's part.
+    """
+
+    def __init__(self, num_envs: int, action_size: int, bounds: Bounds, device: torch.device):
+        self.bounds, self.scale = bounds, 1.0
+        self.value = torch.zeros(num_envs, action_size, device=device)
+
+    def set_scale(self, scale: float) -> None:
+        """Puts a share of the bounds in force; raises InputError unless it is in [0, 1]."""
+        if not 0 <= scale <= 1:
+            raise InputError(f"the share of the correction's bounds is {scale}; it has to be between 0 and 1")
+        self.scale = scale
+
+    def begin(self, rows: Int[Tensor, " b"]) -> None:
+        """No correction in the environments that start anew."""
+        self.value[rows] = 0.0
+
+    def apply(self, target: Target, action: Float[Tensor, "n a"], expand: Callable[[Tensor], Tensor]) -> Target:
+        """Takes in an action in [-1, 1] and corrects the target; call once per control step.
+
+        `expand` maps the action's hand part to (n, 20).
+        """
+        self.value += SMOOTHING * (action - self.value)
+        c, bounds = self.scale * self.value, self.bounds
+        turn = quaternion_from_rotation_vector(bounds.rotation * c[:, 3:6])
+        return Target(
+            target.wrist_p + quaternion_apply(target.wrist_q, bounds.position * c[:, :3]),
+            quaternion_multiply(target.wrist_q, turn),
+            target.hand + bounds.joint * expand(c[:, 6:]),
+        )
+
+    def get_state(self) -> dict[str, Tensor]:
+        """What changes during an episode, for state dicts."""
+        return {"correction": self.value.clone()}
+
+    def set_state(self, state: dict[str, Tensor], rows: Tensor | slice) -> None:
+        """Inverse of `get_state` for the given rows."""
+        self.value[rows] = state["correction"].reshape(self.value[rows].shape)
+
+
+def wrist_step(
+    target_p: Float[Tensor, "n 3"],
+    target_q: Float[Tensor, "n 4"],
+    from_p: Float[Tensor, "n 3"],
+    from_q: Float[Tensor, "n 4"],
+    limits: tuple[float, float],
+) -> Float[Tensor, "n 6"]:
+    """World-frame wrist step towards a target, as a normalised action in [-1, 1]^6.
+
+    Translation and rotation are each shortened to `limits` ([m], [rad] per control step), direction kept.
+    """
+    shift = (target_p - from_p) / limits[0]
+    turn = quaternion_multiply(target_q, quaternion_inverse(from_q))
+    spin = rotation_vector_from_quaternion(turn) / limits[1]
+    return torch.cat([v / v.norm(dim=-1, keepdim=True).clamp(min=1) for v in (shift, spin)], -1)

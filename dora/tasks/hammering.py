@@ -1,0 +1,154 @@
+"""Geometry of catching and striking: where a falling hammer will be, and where the wrist must be to strike with it.
+
+Poses are pairs (position (n, 3) [m], quaternion (n, 4) wxyz). The hammer's frame has its origin at the centre of mass,
+the handle along z with the head at +z, and the striking face towards +x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dora.robot.rotations import (
+    quaternion_apply,
+    quaternion_from_matrix,
+    quaternion_from_rotation_vector,
+    quaternion_inverse,
+    quaternion_multiply,
+    rotation_vector_from_quaternion,
+)
+
+GRAVITY = 9.81
+"""[m/s^2]"""
+LATEST = 1.0
+"""Longest fall that is predicted [s]."""
+ROUNDS = 2
+"""Fixed-point iterations of the time of arrival; the spin between them is small."""
+
+Pose = tuple[Tensor, Tensor]
+
+
+def compose(a: Pose, b: Pose) -> Pose:
+    """Pose b, given in frame a, in the frame of a."""
+    return a[0] + quaternion_apply(a[1], b[0]), quaternion_multiply(a[1], b[1])
+
+
+def relative(a: Pose, b: Pose) -> Pose:
+    """Pose b in frame a, both given in one frame."""
+    back = quaternion_inverse(a[1])
+    return quaternion_apply(back, b[0] - a[0]), quaternion_multiply(back, b[1])
+
+
+def inverse(a: Pose) -> Pose:
+    """The frame in which a is given, in frame a."""
+    back = quaternion_inverse(a[1])
+    return -quaternion_apply(back, a[0]), back
+
+
+def fall_time(height: Float[Tensor, " n"], speed: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Time [s] until a body that rises with `speed` [m/s] has fallen by `height` [m]; 0 if it is below already.
+
+    The later root of height + speed t - g t^2 / 2 = 0, at most LATEST.
+    """
+    square = speed.square() + 2 * GRAVITY * height
+    time = (speed + square.clamp(min=0).sqrt()) / GRAVITY
+    return torch.where(square > 0, time, 0.0).clamp(0, LATEST)
+
+
+def predict_goal(
+    body: Pose,
+    velocity: Float[Tensor, "n 3"],
+    spin: Float[Tensor, "n 3"],
+    goal: Pose,
+    height: Float[Tensor, " n"],
+) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
+    """When a falling body's goal comes down to a height, and its pose then.
+
+    Free fall p + v t - g t^2 / 2 with constant spin, exp(w t) q.
+
+    Args:
+        body: pose now.
+        velocity: of its centre of mass [m/s].
+        spin: angular velocity [rad/s].
+        goal: pose now of what moves with the body, such as the wrist pose of a grasp candidate.
+        height: height of the goal's origin that is waited for [m].
+
+    Returns:
+        Time [s], position [m] and orientation of the goal at that time.
+    """
+    carried = relative(body, goal)
+    time, turned = torch.zeros_like(height), body[1]
+    for _ in range(ROUNDS):
+        turned = quaternion_multiply(quaternion_from_rotation_vector(spin * time[:, None]), body[1])
+        lever = quaternion_apply(turned, carried[0])[:, 2]
+        time = fall_time(body[0][:, 2] + lever - height, velocity[:, 2])
+    t = time[:, None]
+    drop = torch.zeros_like(velocity)
+    drop[:, 2] = GRAVITY * time.square() / 2
+    position, quaternion = compose((body[0] + velocity * t - drop, turned), carried)
+    return time, position, quaternion
+
+
+@dataclass(frozen=True)
+class Strike:
+    """A blow: the hammer turns about a horizontal axis at the height of the nail's head until its face meets it.
+
+    Attributes:
+        top: centre of the undriven nail's head (3,) [m], world frame.
+        face: centre of the striking face (n, 3) [m], hammer frame.
+        radius: distance of the axis from the nail [m].
+        yaw: direction of the handle, from hand to head, about the vertical; 0 is +x [rad].
+    """
+
+    top: Tensor
+    face: Tensor
+    radius: float
+    yaw: float = 0.0
+
+    @cached_property
+    def _along(self) -> Tensor:
+        """Horizontal direction (3,) from hand to head."""
+        yaw = torch.tensor(self.yaw)
+        return torch.stack([yaw.cos(), yaw.sin(), torch.zeros(())]).to(self.top)
+
+    @cached_property
+    def _flat(self) -> Tensor:
+        """Orientation (4,) of the hammer at impact: handle horizontal, face down."""
+        down = torch.tensor([0.0, 0.0, -1.0]).to(self.top)
+        return quaternion_from_matrix(torch.stack([down, torch.linalg.cross(self._along, down), self._along], -1))
+
+    def hammer(self, depth: Float[Tensor, " n"], raised: Float[Tensor, " n"], gap: float) -> Pose:
+        """Pose of the hammer raised by an angle [rad] from where its face is `gap` [m] above the nail's head.
+
+        `depth` [m] is how far the nail has sunk.
+        """
+        n = len(depth)
+        top = self.top.repeat(n, 1)
+        top[:, 2] += gap - depth
+        axis = torch.linalg.cross(self._along, torch.tensor([0.0, 0.0, 1.0]).to(self.top))
+        turn = quaternion_from_rotation_vector(axis * raised[:, None])
+        pivot = top - self.radius * self._along
+        quaternion = quaternion_multiply(turn, self._flat.expand(n, 4))
+        face = pivot + quaternion_apply(turn, top - pivot)
+        return face - quaternion_apply(quaternion, self.face), quaternion
+
+
+def slew(start: Pose, goal: Pose, step: float, turn: float) -> Pose:
+    """From `start` towards `goal` on the straight line, by at most `step` [m] and `turn` [rad]."""
+    shift = goal[0] - start[0]
+    spin = rotation_vector_from_quaternion(quaternion_multiply(goal[1], quaternion_inverse(start[1])))
+    steps = torch.maximum(shift.norm(dim=-1) / step, spin.norm(dim=-1) / turn).clamp(min=1)[:, None]
+    quaternion = quaternion_multiply(quaternion_from_rotation_vector(spin / steps), start[1])
+    return start[0] + shift / steps, quaternion / quaternion.norm(dim=-1, keepdim=True)
+
+
+def blend(old: Pose, new: Pose, share: Float[Tensor, " n"] | float) -> Pose:
+    """`old` moved towards `new` by a share of the difference, for nearby orientations (normalised mean)."""
+    share = torch.as_tensor(share).reshape(-1, 1)
+    same = torch.where((old[1] * new[1]).sum(-1, keepdim=True) < 0, -new[1], new[1])
+    quaternion = old[1] + share * (same - old[1])
+    return old[0] + share * (new[0] - old[0]), quaternion / quaternion.norm(dim=-1, keepdim=True)

@@ -1,0 +1,317 @@
+"""DoraJug-v1: grasp a jug by its handle and lift it upright."""
+
+from functools import cache
+from math import cos, pi, radians
+from typing import ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs import Actor, Pose
+from torch import Tensor
+
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.map import AffordanceMap
+from dora.affordance.objects import load_object
+from dora.affordance.shipped import load_candidates
+from dora.affordance.structure import AffordanceObject
+from dora.affordance.voting import vote
+from dora.robot.rotations import quaternion_apply, quaternion_from_rotation_vector
+from dora.sim.objects import build_object
+from dora.tasks.base import DoraEnv
+from dora.tasks.observations import Entry
+from dora.tasks.rewards import Term, Terms, closeness
+from dora.tasks.snapshot import Snapshot, derived, goal_error, in_wrist, lifted, opposed, tips_in_object
+from dora.tasks.stages import Stage
+
+EMPTY, FULL = 0.30, 0.60
+"""Mass of the empty and of the full jug [kg]."""
+CENTRE = (0.55, 0.0)
+"""Middle of the area where the jug starts [m]."""
+SPREAD = 0.08
+"""Half width of that area [m]."""
+TRIES = 8
+"""Starting poses that are drawn for every episode; the first one that leaves a reachable candidate is taken."""
+LIFT = 0.10
+"""Rise that counts as lifted [m]."""
+UPRIGHT = radians(30)
+"""Largest tilt of a lifted jug [rad]."""
+TIPPED = radians(60)
+"""Tilt at which the jug has tipped over [rad]."""
+DROPPED = 0.05
+"""A jug that has risen this far and stands or lies on the table again was dropped [m]."""
+NEAR = 0.04
+"""Distance of thumb and one more fingertip from the handle that ends the reach [m]."""
+TIP_RADIUS = 0.011
+"""Radius of a fingertip [m]."""
+HOLD = 10
+"""Control steps the lifted jug must be held."""
+DEEPEST = 0.005
+"""Penetration above which an episode does not count as a success [m]."""
+ALPHA = 4.0
+"""Spatial sensitivity of the affordance reward [1/m]."""
+CLASS = "HandleGrasp"
+"""The grasp class that the task asks for."""
+
+
+@cache
+def jug() -> AffordanceObject:
+    """The jug: mesh, regions, collision pieces."""
+    return load_object("jug")
+
+
+@cache
+def jug_map() -> AffordanceMap:
+    """Its affordance map."""
+    return AffordanceMap.from_object(jug())
+
+
+@cache
+def stored_candidates() -> GraspCandidates:
+    """The shipped handle grasps that were validated and ranked."""
+    candidates = load_candidates("jug")
+    return candidates.select(candidates.of_class(CLASS))
+
+
+def _scale(s: Snapshot) -> Float[Tensor, " n"]:
+    """Size of the jug relative to its mesh."""
+    return s.object_half[:, 0] / float(jug().mesh.extents[0] / 2)
+
+
+@derived
+def region_distances(s: Snapshot) -> Float[Tensor, "n 5 r"]:
+    """Distance of each fingertip's surface to each region of the jug [m], negative where it presses in."""
+    scale, regions = _scale(s)[:, None], jug_map()
+    tips = tips_in_object(s) / scale[..., None]
+    distances = [regions.region_distance(tips, name) * scale for name in regions.names]
+    return torch.stack(distances, -1) - TIP_RADIUS
+
+
+def handle_distance(s: Snapshot) -> Float[Tensor, "n 5"]:
+    """The same to the handle alone [m]."""
+    return region_distances(s)[..., jug().labels.index(jug().target)]
+
+
+@derived
+def grasp_label(s: Snapshot) -> Int[Tensor, " n"]:
+    """The region that the hand's actual contacts vote for, an index into the jug's labels; -1 without contact."""
+    return vote(jug_map(), s.contact_p / _scale(s)[:, None, None], s.contact_finger)
+
+
+def by_the_handle(s: Snapshot) -> Bool[Tensor, " n"]:
+    """The grasp's class by voting is HandleGrasp."""
+    return grasp_label(s) == jug().classes.index(CLASS)
+
+
+@derived
+def uprightness(s: Snapshot) -> Float[Tensor, " n"]:
+    """Cosine of the jug's tilt."""
+    up = torch.zeros_like(s.object_p)
+    up[:, 2] = 1.0
+    return quaternion_apply(s.object_q, up)[:, 2]
+
+
+def _worst(distance: Tensor) -> Tensor:
+    """Distance of thumb and nearest finger (n, 5) -> (n,): the larger of the two."""
+    near = distance.clamp(min=0)
+    return torch.maximum(near[:, 0], near[:, 1:].amin(-1))
+
+
+def _reach(s: Snapshot) -> Tensor:
+    return _worst(handle_distance(s))
+
+
+def _rise(s: Snapshot) -> Tensor:
+    return (lifted(s) / LIFT).clamp(0, 1)
+
+
+@derived
+def held(s: Snapshot) -> Bool[Tensor, " n"]:
+    """Lifted, upright, by thumb and finger, off the table."""
+    return (lifted(s) > LIFT) & (uprightness(s) > cos(UPRIGHT)) & opposed(s) & ~s.supported
+
+
+def _away(s: Snapshot) -> Tensor:
+    return _worst(region_distances(s).amin(-1))
+
+
+STAGES: list[Stage[Snapshot]] = [
+    Stage("reach", lambda s: closeness(_reach(s), NEAR, 0.25), lambda s: _reach(s) < NEAR),
+    Stage(
+        "grasp",
+        lambda s: (s.touch[:, 0].float() + s.touch[:, 1:5].any(-1) + by_the_handle(s)) / 3,
+        lambda s: opposed(s) & by_the_handle(s),
+        hold=3,
+        lost=lambda s: _reach(s) > 3 * NEAR,
+        back_to="reach",
+    ),
+    Stage(
+        "lift",
+        _rise,
+        lambda s: held(s) & by_the_handle(s),
+        hold=HOLD,
+        lost=lambda s: _away(s) > 2 * NEAR,
+        back_to="reach",
+    ),
+]
+
+
+def _affordance(s: Snapshot) -> Tensor:
+    """R_affordance with the distance of every fingertip to the nearest point of the handle."""
+    return torch.exp(-ALPHA * handle_distance(s).clamp(min=0).sum(-1))
+
+
+def _candidate(s: Snapshot) -> Tensor:
+    """Candidate term: 1 at the wrist pose the candidate asks for; held at 1 once the jug has left the table."""
+    shift, turn = goal_error(s)
+    near = closeness(shift.norm(dim=-1) + 0.1 * turn.norm(dim=-1), 0.01, 0.2)
+    return torch.where(lifted(s) > 0.02, torch.ones_like(near), near)
+
+
+def _grasp(s: Snapshot) -> Tensor:
+    return 0.6 * opposed(s).float() + 0.1 * s.touch[:, 1:5].sum(-1)
+
+
+def _lift(s: Snapshot) -> Tensor:
+    """Rise, less of it the more the jug tilts: half of it at the largest tilt that counts."""
+    level = 1 - 0.5 * (1 - uprightness(s)) / (1 - cos(UPRIGHT))
+    return _rise(s) * (0.3 + 0.7 * opposed(s).float()) * level.clamp(0, 1)
+
+
+def _clean(s: Snapshot) -> Tensor:
+    return (held(s) & (s.deepest <= DEEPEST)).float()
+
+
+def _tilt(s: Snapshot) -> Tensor:
+    return (1 - uprightness(s)).clamp(0, 1)
+
+
+def _deep(s: Snapshot) -> Tensor:
+    return ((s.penetration - 0.001) / DEEPEST).clamp(0, 1)
+
+
+def _effort(s: Snapshot) -> Tensor:
+    return s.action.square().mean(-1).clamp(max=1)
+
+
+def _change(s: Snapshot) -> Tensor:
+    return ((s.action - s.previous_action).square().mean(-1) / 4).clamp(max=1)
+
+
+TERMS: Terms[Snapshot] = Terms(
+    {
+        "affordance": Term(_affordance, 0.3, "affordance", True, "exp(-alpha * sum of fingertip distances to handle)"),
+        "candidate": Term(_candidate, 0.3, "task", True, "closeness of the wrist to the candidate"),
+        "class": Term(lambda s: by_the_handle(s).float(), 0.4, "task", True, "the contacts vote for HandleGrasp"),
+        "reach": Term(lambda s: closeness(_away(s), 0.0, 0.25), 0.3, doc="thumb and one finger near the jug"),
+        "grasp": Term(_grasp, 0.4, doc="contacts: thumb against a finger, and how many fingers"),
+        "lift": Term(_lift, 3.0, doc="rise, saturating at the target height, less if tilted"),
+        "held": Term(_clean, 1.5, doc="lifted, upright, opposed, off the table, no overlap above 5 mm so far"),
+        "tilt": Term(_tilt, -0.3, "penalty", doc="1 - cosine of the tilt"),
+        "effort": Term(_effort, -0.05, "penalty", doc="mean square of the action"),
+        "change": Term(_change, -0.4, "penalty", doc="mean square of the action's change"),
+        "penetration": Term(_deep, -1.0, "penalty", doc="overlap beyond 1 mm"),
+    }
+)
+
+
+@cache
+def _handle_centre() -> Tensor:
+    return torch.as_tensor(jug().centroid(jug().target), dtype=torch.float32)
+
+
+def handle_p(s: Snapshot) -> Float[Tensor, "n 3"]:
+    """Centre of the handle, world frame [m]: the paper's p_afford."""
+    return s.object_p + quaternion_apply(s.object_q, _scale(s)[:, None] * _handle_centre())
+
+
+def _paper_affordance(s: Snapshot) -> Tensor:
+    return torch.exp(-ALPHA * (s.tip_p - handle_p(s)[:, None]).norm(dim=-1).sum(-1))
+
+
+PAPER_TERMS: Terms[Snapshot] = Terms(
+    {
+        "affordance": Term(_paper_affordance, 1.0, "affordance", True, "exp(-alpha sum ||p_tip - p_afford||)"),
+        "grasp": Term(
+            lambda s: torch.exp((s.wrist_p - s.goal_p)[:, 2].clamp(max=0)) * (s.stage < 2),
+            1.0,
+            guided=True,
+            doc="exp(z_current - z_candidate), z clipped at the candidate",
+        ),
+        "lift": Term(
+            lambda s: torch.exp(lifted(s).clamp(0, LIFT) - LIFT) * (s.stage >= 2),
+            1.0,
+            doc="exp(z - z_0), saturating",
+        ),
+        "penalty": Term(lambda s: s.action.square().mean(-1).clamp(max=1), -0.1, "penalty", doc="sum of action^2"),
+    }
+)
+
+
+def _label_one_hot(s: Snapshot) -> Tensor:
+    labels = torch.arange(len(jug().labels), device=s.object_p.device)
+    return (grasp_label(s)[:, None] == labels).float()
+
+
+@register_env("DoraJug-v1", max_episode_steps=120)
+class JugEnv(DoraEnv):
+    """Grasp a jug by its handle with the five-fingered hand and lift it upright.
+
+    **Randomisations:** position within +-8 cm and yaw, wherever the arm can carry out at least one stored candidate;
+    mass from empty to full; size, friction, candidate error, observation noise, delay and pushes by preset.
+
+    **Stages:** reach (thumb and one fingertip within 4 cm of the handle), grasp (thumb and one more finger touch the
+    jug, and all contacts together vote for HandleGrasp, for 3 steps), lift (>= 10 cm above its start, tilted by at
+    most 30 degrees, held like that, off the table, for 10 steps).
+
+    **Success:** all stages done, and no overlap above 5 mm in the whole episode.
+
+    **Failure:** the jug tips over (60 degrees), is dropped back onto the table after a rise of 5 cm, falls off the
+    table or is knocked more than 60 cm away.
+    """
+
+    STAGES = STAGES
+    TERMS = TERMS
+    PAPER_TERMS = PAPER_TERMS
+    EXTRA_OBSERVATIONS: ClassVar[dict[str, Entry]] = {
+        "scale": Entry(lambda s: _scale(s)[:, None], "1", "size of the jug relative to the nominal one"),
+        "surface": Entry(lambda s: region_distances(s).amin(-1), "m", "distance of each fingertip from the jug"),
+        "handle": Entry(handle_distance, "m", "distance of each fingertip from the handle", True),
+        "handle_p": Entry(lambda s: in_wrist(s, handle_p(s)), "m", "centre of the handle in the hand frame", True),
+        "class": Entry(_label_one_hot, "1", "region that the contacts vote for: body, handle, rim", True),
+    }
+    DRAWS = 3 * TRIES
+    MAX_STEPS = 120
+    DEEPEST = DEEPEST
+    CONTACT_POINTS = 32
+
+    def candidates(self) -> GraspCandidates:
+        return stored_candidates()
+
+    def load_object(self, scale: np.ndarray) -> Actor:
+        half = torch.as_tensor(jug().mesh.extents / 2, dtype=torch.float32, device=self.device)
+        self.object_half = half * torch.as_tensor(scale, dtype=torch.float32, device=self.device)[:, None]
+        return build_object(self.scene, jug(), scale=scale, mass=(EMPTY + FULL) / 2)
+
+    def masses(self, nominal: Float[Tensor, " b"], u: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
+        """Anything from empty to full, or half full with a preset that does not vary masses."""
+        return EMPTY + (FULL - EMPTY) * u if self.preset.mass > 0 else nominal
+
+    def place(self, env_idx: Tensor, u: Tensor) -> None:
+        u = u.reshape(-1, TRIES, 3)
+        height = jug().support * self.scale[env_idx, None].expand(-1, TRIES)
+        x, y = (c + SPREAD * (2 * u[..., k] - 1) for k, c in enumerate(CENTRE))
+        position = torch.stack([x, y, height], -1)
+        turn = torch.zeros_like(position)
+        turn[..., 2] = 2 * pi * u[..., 2]
+        quaternion = quaternion_from_rotation_vector(turn)
+        able = self.reachable(position.flatten(0, 1), quaternion.flatten(0, 1)).any(-1).reshape(-1, TRIES)
+        chosen = torch.arange(len(u), device=self.device), able.float().argmax(-1)
+        self.target_object.set_pose(Pose.create_from_pq(position[chosen], quaternion[chosen]))
+
+    def failed(self, s: Snapshot) -> Bool[Tensor, " n"]:
+        """Also when the jug has tipped over, or stands on the table again after it was lifted."""
+        tipped = uprightness(s) < cos(TIPPED)
+        dropped = s.supported & (self.episode.highest > DROPPED)
+        return super().failed(s) | tipped | dropped

@@ -1,0 +1,191 @@
+"""A nail in a post: a prismatic joint that gives way to blows and to nothing else.
+
+A nail's friction resists both ways. PhysX has no such joint friction here, and drives that are limited in force absorb
+a blow like a mass. What works is a viscous drive, a constant force upwards, and a lower limit that follows the nail
+down, so that it never comes back up: while the nail moves,
+
+    m a = F_hammer - RESISTANCE - DRAG * v,    v >= 0.
+
+The hammer's blow starts the nail at nearly the hammer's speed and is then spent against drag and resistance. Pushing
+moves it too, if slowly, and a nail pushed in has not been hammered: only what the nail sinks within `BLOW_WINDOW`
+after an impact above `BLOW_SPEED` counts as driven.
+"""
+
+import numpy as np
+import sapien
+import torch
+from jaxtyping import Float, Int
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.utils.structs import Actor, Articulation, Link
+from sapien.physx import PhysxMaterial
+from torch import Tensor
+
+from dora.sim.substeps import watch_physics
+
+TRAVEL = 0.025
+"""How far the nail can sink [m]."""
+STAND = 0.03
+"""Height of the nail's head above the post before the first blow [m]."""
+HEAD_RADIUS = 0.010
+HEAD_HALF = 0.002
+"""Radius and half thickness of the nail's head [m]."""
+SHANK_RADIUS = 0.003
+"""Radius of the nail, which is only drawn [m]."""
+POST_HALF = 0.04
+"""Half width of the post [m]."""
+MASS = 0.05
+"""Mass of the nail [kg]."""
+RESISTANCE = 20.0
+"""Constant force against the hammer [N]; a fifth more than the fingers hold steadily."""
+DRAG = 40.0
+"""Force per speed against the hammer [N s/m]."""
+DRIVE_LIMIT = 1e4
+"""Largest force of the viscous drive [N]: none."""
+BLOW_SPEED = 0.5
+"""Speed of the striking face relative to the nail above which an impact is a blow [m/s]."""
+BLOW_WINDOW = 0.05
+"""Time after a blow in which the nail's motion counts as driven [s]."""
+MOVED = 1e-6
+"""Sinking in one physics step that is motion and not rounding [m]."""
+NEAR = 0.3
+"""Distance of the hammer's centre from the nail within which its speed is watched [m]."""
+FRICTION = 0.5
+DOWN = (0.7071068, 0.0, 0.7071068, 0.0)
+"""Turns +x, the axis of joints and cylinders, into -z: the joint's coordinate is the nail's depth."""
+PINE = (0.78, 0.60, 0.38, 1.0)
+IRON = (0.45, 0.46, 0.48, 1.0)
+
+
+class Nail:
+    """One upright nail per environment, in a post that stands on the table.
+
+    Args:
+        scene: the scene of all environments, on a CPU.
+        top: centre of the upper face of the undriven nail's head [m], world frame.
+        dt: duration of a physics step [s].
+    """
+
+    def __init__(self, scene: ManiSkillScene, top: tuple[float, float, float], dt: float):
+        self.top, self._dt, self._device = top, dt, scene.device
+        self.articulation = _build(scene, top)
+        joint = self.articulation.active_joints[0]
+        joint.set_drive_properties(0.0, DRAG, force_limit=DRIVE_LIMIT)
+        self._joints, self._bodies = joint._objs, self.articulation._objs
+        n = scene.num_envs
+        self._depth = np.zeros(n, np.float32)
+        self._driven = np.zeros(n, np.float32)
+        self._since = np.full(n, BLOW_WINDOW, np.float32)
+        self._speed = np.zeros(n, np.float32)
+        self._impact = np.zeros(n, np.float32)
+        self._hammers: list[sapien.physx.PhysxRigidDynamicComponent] = []
+        self._faces: Float[np.ndarray, "n 3"] = np.zeros((n, 3))
+        self._scene = scene
+
+    @property
+    def links(self) -> list[Link]:
+        """The post and the nail."""
+        return self.articulation.links
+
+    def strike_with(self, hammer: Actor, faces: Float[np.ndarray, "n 3"]) -> None:
+        """Watches the blows of hammers whose striking faces have their centres at `faces` [m], object frame."""
+        self._hammers, self._faces = list(hammer._bodies), faces
+        watch_physics(self._scene, self._watch)
+
+    def begin(self, rows: Int[Tensor, " b"]) -> None:
+        """Pulls the nails of the environments `rows` out."""
+        self.articulation.set_qpos(torch.zeros(len(rows), 1, device=self._device))
+        self.articulation.set_qvel(torch.zeros(len(rows), 1, device=self._device))
+        index = rows.cpu().numpy()
+        for buffer in (self._depth, self._driven, self._speed, self._impact):
+            buffer[index] = 0.0
+        self._since[index] = BLOW_WINDOW
+        self._hold(index.tolist())
+
+    def _hold(self, rows: list[int]) -> None:
+        """Lets nails rise no higher than they are, and presses them up."""
+        for i in rows:
+            self._joints[i].set_limits(np.array([[min(self._depth[i], TRAVEL - MOVED), TRAVEL]], np.float32))
+            self._bodies[i].set_qf(np.array([-RESISTANCE], np.float32))
+
+    def _watch(self, i: int) -> None:
+        """After a physics step of environment i: the ratchet, and what the step's motion counts."""
+        body, before = self._bodies[i], self._depth[i]
+        depth = float(body.qpos[0])
+        self._since[i] += self._dt
+        if depth > before + MOVED:
+            if self._speed[i] > BLOW_SPEED:
+                self._since[i] = 0.0
+                self._impact[i] = self._speed[i]
+            if self._since[i] < BLOW_WINDOW:
+                self._driven[i] += depth - before
+            self._depth[i] = depth
+            self._joints[i].set_limits(np.array([[min(depth, TRAVEL - MOVED), TRAVEL]], np.float32))
+        self._speed[i] = self._approach(i, float(body.qvel[0]))
+
+    def _approach(self, i: int, nail_speed: float) -> float:
+        """Downward speed of the striking face relative to the nail [m/s]; 0 if the hammer is far away."""
+        hammer = self._hammers[i]
+        pose = hammer.entity_pose
+        away = pose.p - self.top
+        if away @ away > NEAR * NEAR:
+            return 0.0
+        arm = pose.to_transformation_matrix()[:3, :3] @ self._faces[i]
+        spin = hammer.angular_velocity
+        down = -(hammer.linear_velocity[2] + spin[0] * arm[1] - spin[1] * arm[0])
+        return float(down) - nail_speed
+
+    @property
+    def depth(self) -> Float[Tensor, " n"]:
+        """How far each nail has sunk [m]."""
+        return torch.tensor(self._depth, device=self._device)
+
+    @property
+    def driven(self) -> Float[Tensor, " n"]:
+        """How far each nail has been driven by blows [m]."""
+        return torch.tensor(self._driven, device=self._device)
+
+    @property
+    def impact(self) -> Float[Tensor, " n"]:
+        """Speed of the last blow [m/s]; 0 before the first."""
+        return torch.tensor(self._impact, device=self._device)
+
+    def get_state(self) -> dict[str, Tensor]:
+        """What the simulator does not keep, each (n,)."""
+        names = ("_depth", "_driven", "_since", "_speed", "_impact")
+        return {f"nail{name}": torch.tensor(getattr(self, name), device=self._device) for name in names}
+
+    def set_state(self, state: dict[str, Tensor], rows: Tensor) -> None:
+        """Inverse of `get_state` for the environments `rows` (b,)."""
+        index = rows.cpu().numpy()
+        for name in ("_depth", "_driven", "_since", "_speed", "_impact"):
+            getattr(self, name)[index] = state[f"nail{name}"].reshape(-1).cpu().numpy()
+        self._hold(index.tolist())
+
+
+def _build(scene: ManiSkillScene, top: tuple[float, float, float]) -> Articulation:
+    """Post and nail as an articulation; its root is where the top of the undriven nail is."""
+    builder = scene.create_articulation_builder()
+    material = PhysxMaterial(FRICTION, FRICTION, 0.0)
+    height = top[2] - STAND
+    post = builder.create_link_builder()
+    post.set_name("post")
+    centre, half = sapien.Pose([0, 0, -STAND - height / 2]), [POST_HALF, POST_HALF, height / 2]
+    post.add_box_collision(centre, half, material)
+    nail = builder.create_link_builder(post)
+    nail.set_name("nail")
+    axis = sapien.Pose(q=DOWN)
+    nail.set_joint_name("nail")
+    nail.set_joint_properties("prismatic", [[0.0, TRAVEL]], axis, axis, friction=0.0, damping=0.0)
+    head = sapien.Pose([0, 0, -HEAD_HALF], DOWN)
+    density = MASS / (np.pi * HEAD_RADIUS**2 * 2 * HEAD_HALF)
+    nail.add_cylinder_collision(head, HEAD_RADIUS, HEAD_HALF, material, density=density)
+    if scene.can_render():
+        pine, iron = (sapien.render.RenderMaterial(base_color=list(c), roughness=0.6) for c in (PINE, IRON))
+        post.add_box_visual(centre, half, pine)
+        nail.add_cylinder_visual(head, HEAD_RADIUS, HEAD_HALF, iron)
+        nail.add_cylinder_visual(sapien.Pose([0, 0, -TRAVEL], DOWN), SHANK_RADIUS, TRAVEL, iron)
+    builder.initial_pose = sapien.Pose(list(top))
+    articulation = builder.build("nail", fix_root_link=True)
+    for link in articulation.links:
+        link.disable_gravity = True
+    return articulation

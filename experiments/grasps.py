@@ -1,0 +1,121 @@
+"""Generate grasps of an object, judge them, and store them.
+
+    python experiments/grasps.py --object jug --num 256 --validate sapien --out runs/jug.safetensors
+    python experiments/grasps.py --mesh mug.glb --labels mug.yaml --scale 0.001 --region handle
+
+Prints a table with two baselines beside it (a search without E_DFC, and one iteration of it), and writes OUT
+(safetensors) and a .json beside it. `experiments/view.py OUT` shows the grasps.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from dora.affordance.importing import import_object
+from dora.affordance.objects import load_object
+from dora.affordance.structure import AffordanceObject
+from dora.errors import InputError
+from dora.progress import PhaseProgress
+from dora.robot import load_robot
+from dora.sim.grasp_report import check_out, print_report, write_report
+from dora.sim.grasps import baselines, generate, summary
+from dora.sim.shipping import ship
+
+INTERRUPTED = 130  # exit status after Ctrl-C
+BAD_INPUT = 2  # exit status after input that a person can mend
+ANY = "any"  # value of --region for a free search
+
+
+@dataclass
+class Args:
+    """Generate grasps of one of our objects (--object) or of a mesh (--mesh)."""
+
+    object: Literal["cube", "jug", "hammer", "microwave"] | None = None
+    """One of our objects; "microwave" is the handle of a microwave's door."""
+    mesh: Path | None = None
+    """Your own mesh: OBJ, STL, PLY or GLB, closed or nearly so."""
+    labels: Path | None = None
+    """Regions of --mesh: a file with one label per face, or a YAML of boxes and planes (docs/objects.md)."""
+    num: int = 256
+    """Candidates to search for."""
+    seed: int = 0
+    """Seed of all random draws."""
+    region: str | None = None
+    """Region to hold, or "any" (default: what the task wants of our objects, any of a mesh)."""
+    scale: float = 1.0
+    """Metres per unit of --mesh: 0.001 if it is in millimetres."""
+    robot: str = "diana7_hit"
+    """Robot whose hand grasps: a folder name in robots/ or a path."""
+    out: Path | None = None
+    """File to write (default runs/grasps/<object>.safetensors); the report goes beside it as .json."""
+    validate: Literal["none", "sapien"] = "none"
+    """Close the hand and pull along six directions in SAPIEN, or only measure penetration."""
+    baselines: int = 64
+    """Candidates of each baseline; 0 leaves the baselines out."""
+    ship: bool = False
+    """Make the set that comes with Dora instead: enough valid grasps, ranked by simulated lifts."""
+
+
+def target(args: Args) -> tuple[AffordanceObject, str | None]:
+    """The object, and the region to hold (None: any)."""
+    if (args.object is None) == (args.mesh is None):
+        raise InputError("Give either --object or --mesh, for example --object jug.")
+    if args.num < 1 or args.baselines < 0:
+        raise InputError(f"--num is {args.num} and --baselines {args.baselines}: at least 1 and 0 are needed.")
+    if args.object is not None:
+        if args.labels is not None or args.scale != 1:
+            raise InputError("--labels and --scale belong to --mesh: leave them out with --object.")
+        obj = load_object(args.object)
+        return obj, region_of(obj, args.region or obj.target)
+    assert args.mesh is not None
+    obj = import_object(args.mesh, labels=args.labels, scale=args.scale)
+    return obj, region_of(obj, args.region or ANY)
+
+
+def region_of(obj: AffordanceObject, region: str) -> str | None:
+    """A region that the object has; None for any."""
+    if region == ANY:
+        return None
+    obj.label_index(region)
+    return region
+
+
+def run(args: Args) -> None:
+    """Generate, print and write."""
+    obj, region = target(args)
+    robot = load_robot(args.robot)
+    out = args.out or Path("runs") / "grasps" / f"{obj.name}.safetensors"
+    check_out(out)
+    simulate = args.validate == "sapien"
+    with PhaseProgress() as phases:
+        generated = generate(obj, robot, args.num, args.seed, region, phases, simulate)
+        report = summary(generated)
+        if args.baselines:
+            report["baselines"] = baselines(obj, robot, args.baselines, args.seed, region, phases, simulate)
+    print_report(report)
+    write_report(report, generated.candidates, out)
+    print(out)
+
+
+def main() -> int:
+    """Run the command; returns the exit status."""
+    args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
+    try:
+        if args.ship:
+            print(ship(args.object, args.robot, args.seed))
+        else:
+            run(args)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("Interrupted; nothing was written.", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

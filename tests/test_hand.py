@@ -1,0 +1,161 @@
+"""The batched hand model against pytorch_kinematics, finite differences and its own geometry."""
+
+import numpy as np
+import pytest
+import pytorch_kinematics
+import torch
+
+from dora.affordance.hand import PALM, HandModel
+from dora.affordance.hand_shapes import Capsule, capsules_of, farthest_points
+from dora.robot import RobotDescription, Shape, load_robot
+from dora.robot.rotations import matrix_from_rotation_vector
+
+POSITION_TOLERANCE = 1e-5
+"""Largest accepted difference of two libraries' frames (m, and unitless for rotation entries)."""
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotDescription:
+    return load_robot("diana7_hit")
+
+
+@pytest.fixture(scope="module")
+def hand(robot) -> HandModel:
+    return HandModel(robot, dtype=torch.float64)
+
+
+def random_wrist(count: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    wrist = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    wrist[:, :3, :3] = matrix_from_rotation_vector(torch.randn(count, 3, generator=generator, dtype=torch.float64))
+    wrist[:, :3, 3] = 0.1 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    return wrist
+
+
+def random_joints(hand: HandModel, count: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    share = torch.rand(count, len(hand.lower), generator=generator, dtype=torch.float64)
+    return hand.lower + (hand.upper - hand.lower) * share
+
+
+def test_agrees_with_pytorch_kinematics(robot, hand):
+    chain = pytorch_kinematics.build_chain_from_urdf(robot.urdf.read_bytes()).to(dtype=torch.float64)
+    joints = random_joints(hand, 16)
+    full = robot.expand_hand(joints)
+    angles = {name: full[:, index] for index, name in enumerate(robot.hand.names)}
+    angles |= {name: torch.zeros(16, dtype=torch.float64) for name in robot.arm.names}
+    theirs = {name: frame.get_matrix() for name, frame in chain.forward_kinematics(angles).items()}
+    wrist = theirs[robot.wrist_link]
+    ours = hand.forward(wrist, joints)
+    expected = torch.stack([theirs[link] for link in hand.links], 1)
+    assert (ours - expected).abs().max() < POSITION_TOLERANCE
+
+
+def test_coupled_joints_follow(robot, hand):
+    joints = random_joints(hand, 3)
+    order = [robot.hand.names.index(name) for finger in robot.fingers.values() for name in finger.joints]
+    assert torch.allclose(hand.all_joints(joints), robot.expand_hand(joints)[:, order])
+    assert torch.allclose(hand.upper.numpy() * torch.ones(1), torch.tensor(robot.hand.upper[robot.hand_actuated]))
+
+
+def test_points_move_with_their_bodies(hand):
+    poses = hand.forward(random_wrist(4), random_joints(hand, 4))
+    for points in (hand.spheres, hand.contacts, hand.ends):
+        frames = poses[:, points.body]
+        expected = (frames[..., :3, :3] @ points.local[..., None]).squeeze(-1) + frames[..., :3, 3]
+        assert torch.allclose(hand.place(poses, points), expected, atol=1e-12)
+
+
+def test_fingers_with_different_numbers_of_points(hand):
+    keep = torch.arange(0, len(hand.contacts.body), 7)
+    points = hand._points(hand.contacts.body[keep].numpy(), hand.contacts.local[keep].numpy())
+    poses = hand.forward(random_wrist(2), random_joints(hand, 2))
+    assert points.columns is not None
+    assert torch.allclose(hand.place(poses, points), hand.place(poses, hand.contacts)[:, keep], atol=1e-12)
+
+
+def test_pull_back_is_the_transposed_jacobian(hand):
+    wrist, joints = random_wrist(3), random_joints(hand, 3)
+    force = torch.randn(3, len(hand.spheres.body), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    poses = hand.forward(wrist, joints)
+    points = hand.place(poses, hand.spheres)
+    wrench = torch.zeros(3, len(hand.links), 6, dtype=torch.float64)
+    wrench.index_add_(1, hand.spheres.body, torch.cat((force, torch.linalg.cross(points, force)), -1))
+    on_wrist, on_joints = hand.pull_back(poses, wrench)
+
+    def work(move: torch.Tensor) -> torch.Tensor:
+        moved = wrist.clone()
+        moved[:, :3, 3] += move[:, :3]
+        moved[:, :3, :3] = matrix_from_rotation_vector(move[:, 3:6]) @ wrist[:, :3, :3]
+        return (force * hand.place(hand.forward(moved, joints + move[:, 6:]), hand.spheres)).sum()
+
+    move = torch.zeros(3, 6 + joints.shape[1], dtype=torch.float64, requires_grad=True)
+    work(move).backward()
+    assert move.grad is not None
+    assert torch.allclose(torch.cat((on_wrist, on_joints), 1), move.grad, atol=1e-9)
+
+
+def test_contact_points_are_on_the_surface_and_face_inwards(hand):
+    bodies = set(hand.contacts.body.tolist())
+    assert bodies == {capsule.body for capsule in hand.capsules}
+    for body in bodies:
+        points = hand.contacts.local[hand.contacts.body == body].numpy()
+        gap = np.min([c.distance(points) for c in hand.capsules if c.body == body], axis=0)
+        assert np.abs(gap).max() < 3e-4
+    closed = torch.clamp(torch.full_like(hand.lower, 0.4), hand.lower, hand.upper)[None] * (hand.lower > -0.1)
+    poses = hand.forward(torch.eye(4, dtype=torch.float64)[None], closed)
+    normal = (poses[0, hand.contacts.body, :3, :3] @ hand.contact_normal[..., None]).squeeze(-1)
+    palm, fingers = hand.contact_part == PALM, hand.contact_part > PALM + 1
+    assert (normal[palm] @ torch.tensor(hand.grip.normal)).min() > 0.5
+    assert (normal[fingers] @ torch.tensor(hand.grip.normal)).mean() > 0.4
+
+
+def test_grip_frame_of_this_hand(hand):
+    assert hand.grip.normal @ [1, 0, 0] > 0.99
+    assert hand.grip.along @ [0, 0, 1] > 0.99
+    assert hand.grip.across @ [0, 1, 0] > 0.99
+
+
+def test_spheres_lie_in_the_capsules_and_cover_their_axes(hand):
+    for capsule in hand.capsules:
+        centers = capsule.spheres()
+        assert np.abs(capsule.nearest(centers) - centers).max() < 1e-12
+        assert np.linalg.norm(np.diff(centers, axis=0), axis=1).max(initial=0) < 2 * capsule.radius
+
+
+def test_only_pairs_that_may_collide_are_watched(robot, hand):
+    links = {tuple(sorted((hand.capsules[i].link, hand.capsules[j].link))) for i, j in hand.pairs.tolist()}
+    assert links
+    assert not links & robot.ignored_pairs
+
+
+@pytest.mark.parametrize(
+    ("shape", "inside"),
+    [
+        (Shape("box", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.03, 0.01, 0.02)), 8),
+        (Shape("cylinder", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.01, 0.03)), 1),
+        (Shape("sphere", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.01,)), 1),
+        (Shape("capsule", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.01, 0.03)), 1),
+    ],
+)
+def test_capsules_of_every_kind_of_shape_stay_inside_it(shape, inside):
+    capsules = capsules_of(shape, 0, "link", np.eye(4))
+    assert 1 <= len(capsules) <= inside
+    reach = np.max([np.abs(np.stack((c.start, c.end))).max(0) + c.radius for c in capsules], axis=0)
+    half = np.array(shape.size) if shape.kind == "box" else np.array([shape.size[-1], shape.size[0], shape.size[0]])
+    if shape.kind == "capsule":
+        half[0] += shape.size[0]
+    np.testing.assert_allclose(reach, half)
+
+
+def test_farthest_points_spread():
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    chosen = farthest_points(points, 10)
+    assert len(set(chosen.tolist())) == 10
+    assert len(farthest_points(points[:4], 10)) == 4
+
+
+def test_capsule_without_length_is_a_sphere():
+    capsule = Capsule(0, "link", np.zeros(3), np.zeros(3), 0.01)
+    assert capsule.spheres().shape == (1, 3)
+    np.testing.assert_allclose(capsule.distance(np.array([[0.03, 0.0, 0.0]])), 0.02)
