@@ -63,7 +63,7 @@ class CollisionModel:
             hand), "table" (arm or hand), "arm object" and "hand object". By default all, at 0.
 
     Raises:
-        InputError: Pinocchio or Coal is not installed.
+        InputError: Pinocchio or Coal is not installed, or `clearance` has an unknown kind.
     """
 
     def __init__(
@@ -82,6 +82,8 @@ class CollisionModel:
         self._order = np.array([self._model.joints[self._model.getJointId(name)].idx_q for name in names])
         self._q = np.zeros(self._model.nq)
         clearance = dict.fromkeys(KINDS, 0.0) if clearance is None else clearance
+        if unknown := set(clearance) - set(KINDS):
+            raise InputError(f"there are no pairs of the kind {min(unknown)!r}; choose from {', '.join(KINDS)}")
         # The broad phase knows no margin of an unbounded shape: the plane itself is raised.
         plane = self._coal.Halfspace(np.array(table[:3]), table[3] + clearance.get(TABLE, 0.0))
         parts = [*self._robot_parts(), _Part(TABLE, 0, pin.SE3.Identity(), plane)]
@@ -93,9 +95,7 @@ class CollisionModel:
         self._pieces: list[tuple[Any, Any]] = []
         for index in used:
             owner, joint, local, body = parts[index]
-            place[index] = self._geometry.addGeometryObject(
-                pin.GeometryObject(f"{owner} {index}", joint, local, body)
-            )
+            place[index] = self._geometry.addGeometryObject(pin.GeometryObject(f"{owner} {index}", joint, local, body))
             if owner == OBJECT:
                 self._pieces.append((self._geometry.geometryObjects[place[index]], local))
         for i, j, _ in pairs:
@@ -104,11 +104,9 @@ class CollisionModel:
         self._results = self._geometry.createData()
         for request, (*_, kind) in zip(self._results.collisionRequests, pairs, strict=True):
             request.security_margin = 0.0 if kind == TABLE else clearance[kind]
-        self._broad = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager(
-            self._model, self._geometry, self._results
-        )
+        self._broad = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager(self._model, self._geometry, self._results)
 
-    def place_object(self, position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> None:
+    def place_object(self, position: Float[np.ndarray, " 3"], quaternion: Float[np.ndarray, " 4"]) -> None:
         """Move the object to a pose (m, wxyz) in the robot's base frame."""
         pose = self._pose(position, quaternion)
         for part, local in self._pieces:

@@ -85,14 +85,12 @@ class ArmExtent:
         self._parts = [part for part in parts if joints[part[0]].child not in hand_links(robot)]
 
     def height(
-        self, q: Float[Tensor, "*batch dof"], normal: Float[Tensor, "3"], level: float, frames: Frames | None = None
+        self, q: Float[Tensor, "*batch dof"], normal: Float[Tensor, " 3"], level: float, frames: Frames | None = None
     ) -> Float[Tensor, "*batch"]:
         """Lowest height [m] above the plane normal . x = level of the base frame, at arm joints [rad]."""
         poses = (frames or self._chain.forward(q.reshape(-1, q.shape[-1]))).joints
         lowest = [
-            ((normal @ poses[:, i, :3, :3])[:, None] * centres).sum(-1)
-            + (poses[:, i, :3, 3] @ normal)[:, None]
-            - radii
+            ((normal @ poses[:, i, :3, :3])[:, None] * centres).sum(-1) + (poses[:, i, :3, 3] @ normal)[:, None] - radii
             for i, centres, radii in self._parts
         ]
         return (torch.cat(lowest, -1).amin(-1) - level).reshape(q.shape[:-1])

@@ -96,7 +96,9 @@ class InverseKinematics:
         self.chain = SerialChain.of(robot)
         home = robot.postures["home"].arm if start is None else start
         if len(home) != len(robot.arm):
-            raise InputError(f"the start posture has {len(home)} joints; the arm of {robot.name!r} has {len(robot.arm)}")
+            raise InputError(
+                f"the start posture has {len(home)} joints; the arm of {robot.name!r} has {len(robot.arm)}"
+            )
         self.start = torch.tensor(np.asarray(home), dtype=torch.float32)
         self.lower, self.upper = self.chain.lower + LIMIT_MARGIN, self.chain.upper - LIMIT_MARGIN
         first = robot.model.chain(robot.wrist_link)[0]

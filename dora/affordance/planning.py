@@ -67,7 +67,9 @@ def plan(
     arm = model.robot.arm
     for name, q in (("start", start), ("goal", goal)):
         if not ((q >= arm.lower) & (q <= arm.upper)).all():
-            raise InputError(f"the {name} of the motion is outside the joint limits of {model.robot.name!r}; move it inside")
+            raise InputError(
+                f"the {name} of the motion is outside the joint limits of {model.robot.name!r}; move it inside"
+            )
     if not model.free(np.stack([start, goal]), hand):
         return None
     straight = densified(np.stack([start, goal]), EDGE_LIMIT)
@@ -83,9 +85,7 @@ def plan(
 def densified(path: Float[np.ndarray, "k dof"], spacing: float) -> Float[np.ndarray, "m dof"]:
     """The same polygon with points at most `spacing` apart (Euclidean, in the path's unit)."""
     counts = np.maximum(1, np.ceil(np.linalg.norm(np.diff(path, axis=0), axis=1) / spacing)).astype(int)
-    pieces = [
-        a + (b - a) * np.arange(n)[:, None] / n for a, b, n in zip(path[:-1], path[1:], counts, strict=True)
-    ]
+    pieces = [a + (b - a) * np.arange(n)[:, None] / n for a, b, n in zip(path[:-1], path[1:], counts, strict=True)]
     return np.concatenate([*pieces, path[-1:]])
 
 

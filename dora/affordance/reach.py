@@ -20,6 +20,7 @@ from dora.affordance.collision import CollisionModel
 from dora.affordance.extent import ArmExtent, HandExtent
 from dora.affordance.inverse_kinematics import InverseKinematics
 from dora.affordance.planning import plan
+from dora.affordance.structure import AffordanceObject
 from dora.affordance.ways import (
     ARM_COLLISION,
     HAND_OBJECT,
@@ -32,7 +33,6 @@ from dora.affordance.ways import (
     Ways,
     attempts,
 )
-from dora.affordance.structure import AffordanceObject
 from dora.robot import RobotDescription, Shape
 from dora.robot.rotations import (
     matrix_from_quaternion,
@@ -155,8 +155,8 @@ class Reach:
         start: Float[np.ndarray, " dof"],
         goal: Float[np.ndarray, " dof"],
         hand: Float[np.ndarray, " h"],
-        object_p: Float[Tensor, "3"],
-        object_q: Float[Tensor, "4"],
+        object_p: Float[Tensor, " 3"],
+        object_q: Float[Tensor, " 4"],
         seed: int = 0,
     ) -> Float[np.ndarray, "k dof"] | None:
         """Collision-free way points [rad] between two arm postures, see `dora.affordance.planning.plan`."""
@@ -190,7 +190,7 @@ class Reach:
                     break
         return hit
 
-    def wrist_pose(self, q: Float[Tensor, " dof"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "4"]]:
+    def wrist_pose(self, q: Float[Tensor, " dof"]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 4"]]:
         """Pose (m, wxyz) of the wrist in the base frame at arm joints [rad]."""
         position, rotation = self.kinematics.chain.tip_pose(q[None])
         return position[0], quaternion_from_matrix(rotation)[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
 
@@ -57,7 +57,7 @@ class ReachSettings:
     speed: float = 0.15
     seeds: int = 4
     stride: int = 3
-    plan: PlanSettings = PlanSettings()
+    plan: PlanSettings = field(default_factory=PlanSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +106,7 @@ def _count(settings: ReachSettings) -> int:
 
 def _servo(kinematics: InverseKinematics, goals: Goals, start: Tensor, settings: ReachSettings) -> Ways:
     """Ways of the wrist controller; where it fails, the reason is out of reach if there is no solution at all."""
-    m = roll_out(
-        kinematics.chain, start, goals.position, goals.quaternion, goals.approach, settings.standoff
-    )
+    m = roll_out(kinematics.chain, start, goals.position, goals.quaternion, goals.approach, settings.standoff)
     failure = torch.where(m.reached, OK, NO_MOTION)
     lost = (~m.reached).nonzero()[:, 0]
     solved = kinematics.solve(goals.position[lost], goals.quaternion[lost], settings.seeds).solved[:, 0]

@@ -31,7 +31,7 @@ POLL_PROFILE = (
 )  # fmt: skip
 """(x, radius) of the round front of the head, ending in a chamfered striking face."""
 FACE_X = POLL_PROFILE[-1][0]
-CHEEK = (0.027, 0.022, 0.026)
+CHEEK = (0.028, 0.022, 0.026)
 CHEEK_CHAMFER = 0.003
 CLAW_PATH = ((-0.006, 0.0015), (-0.018, 0.0015), (-0.030, -0.001), (-0.042, -0.0065), (-0.053, -0.0160))
 """(x, height above the striking axis) of the claw's middle."""
