@@ -1,7 +1,7 @@
 """Generate grasps of an object, judge them, and store them.
 
     python experiments/grasps.py --object jug --num 256 --validate sapien --out runs/jug.safetensors
-    python experiments/grasps.py --mesh mug.glb --labels mug.yaml --scale 0.001 --region handle
+    python experiments/grasps.py --mesh mug.glb --labels mug.yaml --units mm --region handle
 
 Prints a table with two baselines beside it (a search without E_DFC, and one iteration of it), and writes OUT
 (safetensors) and a .json beside it. `experiments/view.py OUT` shows the grasps.
@@ -46,7 +46,9 @@ class Args:
     region: str | None = None
     """Region to hold, or "any" (default: what the task wants of our objects, any of a mesh)."""
     scale: float = 1.0
-    """Metres per unit of --mesh: 0.001 if it is in millimetres."""
+    """Factor of all lengths of --mesh."""
+    units: Literal["m", "cm", "mm", "in"] = "m"
+    """Unit of length of --mesh; GLB files are in metres."""
     robot: str = "diana7_hit"
     """Robot whose hand grasps: a folder name in robots/ or a path."""
     out: Path | None = None
@@ -56,7 +58,7 @@ class Args:
     baselines: int = 64
     """Candidates of each baseline; 0 leaves the baselines out."""
     ship: bool = False
-    """Make the set that comes with Dora instead: enough valid grasps, ranked by simulated lifts."""
+    """Make the set that comes with Dora for --object instead: enough valid grasps, ranked by simulated lifts."""
 
 
 def target(args: Args) -> tuple[AffordanceObject, str | None]:
@@ -66,12 +68,12 @@ def target(args: Args) -> tuple[AffordanceObject, str | None]:
     if args.num < 1 or args.baselines < 0:
         raise InputError(f"--num is {args.num} and --baselines {args.baselines}: at least 1 and 0 are needed.")
     if args.object is not None:
-        if args.labels is not None or args.scale != 1:
-            raise InputError("--labels and --scale belong to --mesh: leave them out with --object.")
+        if args.labels is not None or args.scale != 1 or args.units != "m":
+            raise InputError("--labels, --scale and --units belong to --mesh: leave them out with --object.")
         obj = load_object(args.object)
         return obj, region_of(obj, args.region or obj.target)
     assert args.mesh is not None
-    obj = import_object(args.mesh, labels=args.labels, scale=args.scale)
+    obj = import_object(args.mesh, labels=args.labels, scale=args.scale, units=args.units)
     return obj, region_of(obj, args.region or ANY)
 
 
@@ -105,7 +107,8 @@ def main() -> int:
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     try:
         if args.ship:
-            print(ship(args.object, args.robot, args.seed))
+            with PhaseProgress() as phases:
+                print(ship(args.object or "", args.seed, phases))
         else:
             run(args)
     except InputError as error:

@@ -79,7 +79,10 @@ def test_ppo_learns_and_leaves_a_complete_folder(tmp_path: Path):
 
 
 def test_sac_learns(tmp_path: Path):
-    learner = SACConfig(batch=128, updates_per_step=1 / 16, warmup=500, hidden=(64, 64), capacity=20_000)
+    learner = SACConfig(
+        batch=128, updates_per_step=1 / 16, warmup=500, critic_only=50, prior=0.0, log_std_max=-0.4,
+        learning_rate=2e-3, learning_rate_actor=2e-3, hidden=(64, 64), capacity=20_000,
+    )  # fmt: skip
     config = dataclasses.replace(
         BASE, agent="sac", guidance="none", total_steps=14_000, eval_every=3_500, learner=learner
     )
@@ -91,7 +94,9 @@ def test_sac_learns(tmp_path: Path):
 @pytest.mark.parametrize("agent", ["ppo", "sac"])
 def test_resuming_goes_on_exactly(tmp_path: Path, agent: str):
     """Episodes end with the rollout and all start alike, so a restart of the environments changes nothing."""
-    learner = SMALL_PPO if agent == "ppo" else SACConfig(rollout=16, batch=64, warmup=100, hidden=(16, 16))
+    learner = (
+        SMALL_PPO if agent == "ppo" else SACConfig(rollout=16, batch=64, warmup=100, critic_only=2, hidden=(16, 16))
+    )
     config = dataclasses.replace(BASE, agent=agent, learner=learner, total_steps=4 * 256, eval_every=512, stagger=False)
     make = functools.partial(PointMass, deterministic=True)
     run(tmp_path / "straight", config, make)

@@ -23,7 +23,7 @@ THRESHOLD = 0.05
 LARGEST_THRESHOLD = 1.0
 ITERATIONS, DEPTH = 60, 2
 """Effort of CoACD's search for each cut; its own 150 and 3 take twice as long for hulls no nearer to our objects."""
-HULL_VERTICES = 128
+HULL_VERTICES = 200
 """Most vertices of a hull: PhysX takes 255, and a contact costs more with each."""
 SAMPLES = 20_000
 """Points of a surface at which the deviation is measured."""

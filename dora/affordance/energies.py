@@ -3,9 +3,10 @@
 | term | part | value |
 |---|---|---|
 | closure | E_DFC | ||G c||^2 at the hand's contact points, c the object's inward normals there |
-| distance | E_HO | sum over contact points of abs(signed distance) (m) |
+| distance | E_HO | sum over contact points of abs(signed distance) (m), times `PALM_IMPORTANCE` for the palm |
 | region | E_HO | sum over contact points of the distance to the region to be held (m) |
-| penetration | E_HO | sum over the hand's spheres of their overlap with the object (m) |
+| closing | E_HO | sum over contact points on fingers by how much they miss the object when the hand closes a little (m) |
+| penetration | E_HO | sum over the hand's spheres of their overlap with the object and a thin skin around it (m) |
 | table | E_HO | sum over the spheres of their depth below the table plus a clearance (m) |
 | limits | E_Robot | sum over the joints of the angle beyond a limit (rad) |
 | self_penetration | E_Robot | sum over pairs of capsules that may collide of their overlap (m) |
@@ -25,12 +26,21 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dora.affordance.hand import HandModel
+from dora.affordance.protocol import STANDARD, flexion
 from dora.affordance.signed_distance import CHANNELS, SignedDistanceField
 
 LENGTH = 0.1
 """Unit of length (m) of the positions psi in G, so that force and torque have comparable size."""
 CLEARANCE = 3e-3
 """Distance (m) that the hand keeps from the table."""
+PALM_IMPORTANCE = 3.0
+"""Factor on the distance of contact points on the palm: it cannot close towards the object as fingers do."""
+CLOSING = 0.25
+"""Share of the protocol's squeeze by which the term `closing` closes the hand."""
+PRESS = 2e-3
+"""Depth (m) in the object that a contact point should reach then."""
+SKIN = 7e-4
+"""Overlap (m) is counted from this far outside the surface: what spheres and interpolation miss."""
 _SMALL = 1e-9
 
 
@@ -41,6 +51,7 @@ class Weights:
     closure: float = 1.0
     distance: float = 100.0
     region: float = 50.0
+    closing: float = 100.0
     penetration: float = 300.0
     table: float = 300.0
     limits: float = 10.0
@@ -104,6 +115,8 @@ class GraspEnergy:
         first, second = hand.pairs.unbind(1)
         self._bound[first, second] = (bound[first] + bound[second]).square()
         self._capsule_body = hand.ends.body[0::2]
+        self._skin = hand.sphere_radius + SKIN
+        self._close = hand.lower.new_tensor(CLOSING * STANDARD.squeeze * hand.robot.reduce_hand(flexion(hand.robot)))
         self._has_region = field.table.shape[1] > CHANNELS
 
     def __call__(
@@ -122,31 +135,53 @@ class GraspEnergy:
             ramp: factor on the weights of `RAMPED`.
         """
         poses = self.hand.forward(wrist, joints)
+        closed = self.hand.forward(wrist, joints + self._close)
         found = self.contact_terms(poses, contacts)
         found |= self.sphere_terms(poses)
         found["self_penetration"] = self.self_penetration(poses)
         terms = {name: value for name, (value, _) in found.items()}
         terms["limits"], slope = self.limits(joints)
+        terms["closing"], push = self.closing(closed, contacts)
         factor = {name: getattr(self.weights, name) * (ramp if name in RAMPED else 1.0) for name in TERMS}
         pushes = [push._replace(force=factor[name] * push.force) for name, (_, push) in found.items()]
         wrench = assemble(len(wrist), poses.shape[1], pushes)
         wrist_gradient, joint_gradient = self.hand.pull_back(poses, wrench)
+        wrench = assemble(len(wrist), poses.shape[1], [push._replace(force=factor["closing"] * push.force)])
+        wrist_closed, joint_closed = self.hand.pull_back(closed, wrench)
         total = torch.stack([factor[name] * value for name, value in terms.items()]).sum(0)
-        return Evaluation(total, terms, wrist_gradient, joint_gradient + factor["limits"] * slope)
+        joint_gradient = joint_gradient + joint_closed + factor["limits"] * slope
+        return Evaluation(total, terms, wrist_gradient + wrist_closed, joint_gradient)
+
+    def contact_points(
+        self, poses: Float[Tensor, "c b 4 4"], contacts: Int[Tensor, "c k"]
+    ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, "n 3"]]:
+        """Row, body and position (m) of n = c k contact points."""
+        count, each = contacts.shape
+        row = torch.arange(count, device=contacts.device).repeat_interleave(each)
+        body = self.hand.contacts.body[contacts].flatten()
+        pose = poses[row, body]
+        local = self.hand.contacts.local[contacts].view(-1, 3, 1)
+        return row, body, (pose[:, :3, :3] @ local).squeeze(-1) + pose[:, :3, 3]
+
+    def closing(self, poses: Float[Tensor, "c b 4 4"], contacts: Int[Tensor, "c k"]) -> tuple[Tensor, Push]:
+        """Sum over contact points on fingers of (distance + `PRESS`)+ where `poses` are those of a closed hand."""
+        row, body, point = self.contact_points(poses, contacts)
+        value, slope = self.field.sample(point, 1)
+        miss = (value[:, 0] + PRESS) * (body > 0)
+        force = slope[:, 0] * (miss > 0).unsqueeze(1)
+        return miss.clamp_min(0).view(contacts.shape).sum(1), Push(row, body, point, force)
 
     def contact_terms(
         self, poses: Float[Tensor, "c b 4 4"], contacts: Int[Tensor, "c k"]
     ) -> dict[str, tuple[Tensor, Push]]:
         """closure, distance and region: what asks the hand to touch, and where."""
         count, each = contacts.shape
-        row = torch.arange(count, device=contacts.device).repeat_interleave(each)
-        body = self.hand.contacts.body[contacts].flatten()
-        pose = poses[row, body]
-        point = (pose[:, :3, :3] @ self.hand.contacts.local[contacts].view(-1, 3, 1)).squeeze(-1) + pose[:, :3, 3]
+        row, body, point = self.contact_points(poses, contacts)
         value, slope = self.field.sample(point)
         terms = {"closure": self._closure(point, value, slope, count, each)}
-        sign = value[:, :1].sign()
-        terms["distance"] = value[:, 0].abs().view(count, each).sum(1), sign * slope[:, 0]
+        importance = torch.where(body == 0, PALM_IMPORTANCE, 1.0).to(value)
+        pull = (importance * value[:, 0].sign()).unsqueeze(1) * slope[:, 0]
+        terms["distance"] = (importance * value[:, 0].abs()).view(count, each).sum(1), pull
         if self._has_region:
             terms["region"] = value[:, CHANNELS].view(count, each).sum(1), slope[:, CHANNELS]
         return {name: (term, Push(row, body, point, force)) for name, (term, force) in terms.items()}
@@ -170,10 +205,10 @@ class GraspEnergy:
         hand = self.hand
         centers = hand.place(poses, hand.spheres)
         terms = {}
-        touching = self.field.may_touch(centers, hand.sphere_radius)
+        touching = self.field.may_touch(centers, self._skin)
         points = centers.view(-1, 3)[touching]
         value, slope = self.field.sample(points, 1)
-        depth = hand.sphere_radius[touching % len(hand.sphere_radius)] - value[:, 0]
+        depth = self._skin[touching % len(self._skin)] - value[:, 0]
         terms["penetration"] = self._overlap(touching, points, depth, -slope[:, 0], len(poses))
         if self.table is not None:
             normal = centers.new_tensor(self.table.normal)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dora.affordance.hand_shapes import Capsule, capsules_of, palmar_points
+from dora.affordance.hand_shapes import BURIED, Capsule, capsules_of, palmar_points
 from dora.errors import InputError
 from dora.robot import RobotDescription
 from dora.robot.kinematics import rodrigues
@@ -196,6 +196,8 @@ class HandModel:
             tip = turn @ along[place] if body and place[1] == self.depth - 1 else None
             facing = turn @ palmar[place] if body else normal
             found = palmar_points(shapes, facing, POINTS_PER_LINK if body else POINTS_ON_PALM, tip)
+            free = _outside_others(self.capsules, poses, body, found[0])
+            found = found[0][free], found[1][free]
             bodies.append(np.full(len(found[0]), body))
             points.append(found[0])
             normals.append(found[1])
@@ -287,6 +289,16 @@ def _colliding(robot: RobotDescription, capsules: tuple[Capsule, ...]) -> list[t
         for j, b in enumerate(capsules[:i])
         if a.body != b.body and (min(a.link, b.link), max(a.link, b.link)) not in robot.ignored_pairs
     ]
+
+
+def _outside_others(capsules: tuple[Capsule, ...], poses: np.ndarray, body: int, points: np.ndarray) -> np.ndarray:
+    """Which points (n, 3) of a body stick out of all other bodies at the given poses (bodies, 4, 4)."""
+    free = np.ones(len(points), dtype=bool)
+    for other in capsules:
+        if other.body != body:
+            pose = np.linalg.inv(poses[other.body]) @ poses[body]
+            free &= other.distance(points @ pose[:3, :3].T + pose[:3, 3]) > BURIED
+    return free
 
 
 def _directions(

@@ -5,16 +5,18 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from functools import cache
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
+from trimesh.visual import ColorVisuals
 
+from dora.affordance.solids import shape_mesh
 from dora.robot import RobotDescription, SerialChain
 from dora.robot.rotations import matrix_from_quaternion
-from dora.robot.shapes import Shape
 
 GAMMA = 2.2
 """Exponent between the linear colours of a glTF material and what a screen shows."""
@@ -81,9 +83,14 @@ def joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     return trimesh.Trimesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.faces + start for mesh, start in zip(meshes, offsets, strict=False)]),
-        face_colors=np.concatenate([mesh.visual.face_colors for mesh in meshes]),
+        face_colors=np.concatenate([face_colours(mesh) for mesh in meshes]),
         process=False,
     )
+
+
+def face_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "f 4"]:
+    """Red, green, blue and opacity of every face of a mesh that has colours, not textures."""
+    return np.asarray(cast(ColorVisuals, mesh.visual).face_colors)
 
 
 def _visual_files(robot: RobotDescription) -> dict[str, list[Path]]:
@@ -97,7 +104,7 @@ def _visual_files(robot: RobotDescription) -> dict[str, list[Path]]:
 
 def _link_mesh(robot: RobotDescription, link: str, visuals: dict[str, list[Path]]) -> trimesh.Trimesh | None:
     parts = [part for path in visuals.get(link, []) if path.is_file() for part in _coloured(path)]
-    parts = parts or [_primitive(shape) for shape in robot.shapes.get(link, ())]
+    parts = parts or [_painted(shape_mesh(shape), np.array(PLAIN)) for shape in robot.shapes.get(link, ())]
     return joined(parts) if parts else None
 
 
@@ -105,28 +112,12 @@ def _link_mesh(robot: RobotDescription, link: str, visuals: dict[str, list[Path]
 def _coloured(path: Path) -> tuple[trimesh.Trimesh, ...]:
     """Geometries of a mesh file with one colour each, as it looks on a screen."""
     parts = []
-    for part in trimesh.load_scene(path).dump():
+    for part in cast(list[trimesh.Trimesh], trimesh.load_scene(path).dump()):
         factor = getattr(getattr(part.visual, "material", None), "baseColorFactor", None)
         linear = np.full(4, 255) if factor is None else np.asarray(factor)
         shown = (linear[:3] / 255) ** (1 / GAMMA)
         parts.append(_painted(part, shown))
     return tuple(parts)
-
-
-def _primitive(shape: Shape) -> trimesh.Trimesh:
-    """A collision shape as triangles in the link frame."""
-    size = shape.size
-    if shape.kind == "box":
-        mesh = trimesh.creation.box(extents=[2 * half for half in size])
-    elif shape.kind == "sphere":
-        mesh = trimesh.creation.icosphere(subdivisions=2, radius=size[0])
-    else:
-        create = trimesh.creation.capsule if shape.kind == "capsule" else trimesh.creation.cylinder
-        mesh = create(height=2 * size[1], radius=size[0])
-        mesh.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], [1, 0, 0]))
-    pose = trimesh.transformations.quaternion_matrix(shape.quaternion)
-    pose[:3, 3] = shape.position
-    return _painted(mesh.apply_transform(pose), np.array(PLAIN))
 
 
 def _painted(mesh: trimesh.Trimesh, color: np.ndarray) -> trimesh.Trimesh:

@@ -23,7 +23,7 @@ PALMAR_COSINE = 0.6
 SAMPLE_DENSITY = 1e6
 """Surface samples per square metre from which contact points are chosen."""
 BURIED = -2e-4
-"""A surface sample deeper than this (m) in another shape of its body is no contact point."""
+"""A surface sample deeper than this (m) in another shape of the straight hand is no contact point."""
 
 
 @dataclass(frozen=True, eq=False)

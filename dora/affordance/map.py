@@ -5,22 +5,30 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import imageio.v3 as imageio
 import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dora.affordance.lookup import RegionField, NearestTable
+from dora.affordance.lookup import NearestTable, RegionField
+from dora.affordance.rasteriser import Camera, render
 from dora.affordance.sampling import sample_evenly
 from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
-from dora.files import read_tensors, write_tensors
+from dora.files import read_tensors, write_bytes, write_tensors
 
 COUNT = 4096
 """Surface points of a map."""
 FORMAT = "dora-map 1"
 """Format and version of a file of a map."""
+PALETTE = ((77, 121, 168), (242, 142, 43), (89, 161, 79), (225, 87, 89), (118, 183, 178), (237, 201, 72))
+"""Colours (red, green, blue) of the regions in pictures, in their order, repeated if there are more."""
+VIEWS = ((-1.0, 0.35), (2.4, 0.35))
+"""Azimuth and elevation (rad) of the pictures."""
+DISC_CORNERS, DISC_SHARE, DISC_LIFT = 8, 0.85, 2e-4
+"""Corners of a point's disc, its radius as a share of that with its area, and its distance (m) from the surface."""
 CANDIDATES_PER_NEIGHBOUR, FEWEST_CANDIDATES = 4, 32
 """Points that a cell of the table knows: this many per neighbour asked for, and at least the second."""
 
@@ -155,6 +163,54 @@ class AffordanceMap:
             "face_labels": torch.tensor(self.face_labels),
         }
         write_tensors(Path(path), FORMAT, self._tensors() | surface, metadata)
+
+    def painted(self) -> trimesh.Trimesh:
+        """The surface with each face in the colour of its region (object frame, m)."""
+        colors = np.array([PALETTE[i % len(PALETTE)] for i in range(len(self.names))], np.uint8)
+        alpha = np.full((len(self.names), 1), 255, np.uint8)
+        rgba = np.concatenate([colors, alpha], 1)[self.face_labels]
+        return trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, face_colors=rgba, process=False)
+
+    def discs(self) -> trimesh.Trimesh:
+        """Every point as a disc as large as the area for which it stands, in the colour of its region."""
+        angle = torch.linspace(0, 2 * torch.pi, DISC_CORNERS + 1)[:-1]
+        first = torch.linalg.cross(self.normals, torch.eye(3)[self.normals.abs().argmin(1)])
+        first = torch.nn.functional.normalize(first, dim=-1)
+        second = torch.linalg.cross(self.normals, first)
+        radius = (self.areas / torch.pi).sqrt()[:, None, None]
+        ring = angle.cos()[:, None] * first[:, None] + angle.sin()[:, None] * second[:, None]
+        corners = (self.points + DISC_LIFT * self.normals)[:, None] + DISC_SHARE * radius * ring
+        fan = torch.tensor([[0, i, i + 1] for i in range(1, DISC_CORNERS - 1)])
+        faces = fan + DISC_CORNERS * torch.arange(len(self))[:, None, None]
+        colors = np.array([PALETTE[i % len(PALETTE)] for i in self.labels.tolist()], np.uint8)
+        colors = np.repeat(np.concatenate([colors, np.full((len(self), 1), 255, np.uint8)], 1), len(fan), axis=0)
+        vertices = corners.reshape(-1, 3).numpy()
+        return trimesh.Trimesh(vertices, faces.reshape(-1, 3).numpy(), face_colors=colors, process=False)
+
+    def picture(self, path: Path | str, size: int = 400) -> None:
+        """Write a PNG: the painted surface from the front and from behind, and the points as discs.
+
+        Args:
+            path: of the file.
+            size: side of each of the three panels (pixels).
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        own = self.to("cpu")
+        views = [(own.painted(), VIEWS[0]), (own.painted(), VIEWS[1]), (own.discs(), VIEWS[0])]
+        panels = []
+        for mesh, (azimuth, elevation) in views:
+            camera = Camera.around([self.mesh], azimuth, elevation)
+            panels.append(render([mesh], camera, size, size))
+        try:
+            imageio.imwrite(path, np.concatenate(panels, axis=1), extension=".png")
+        except OSError as error:
+            raise InputError(f"cannot write {path} ({error.strerror}); choose another folder.") from error
+
+    def export_glb(self, path: Path | str) -> None:
+        """Write the painted surface as binary glTF (m), which every 3D viewer shows; raises InputError as `save`."""
+        write_bytes(Path(path), trimesh.exchange.gltf.export_glb(trimesh.Scene(self.painted())))
 
     @classmethod
     def load(cls, path: Path | str, obj: AffordanceObject | None = None) -> AffordanceMap:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.contact_map import hand_contacts
-from dora.affordance.energies import Evaluation, GraspEnergy, Table, Weights
+from dora.affordance.energies import RAMPED, Evaluation, GraspEnergy, Table, Weights
 from dora.affordance.hand import HandModel
 from dora.affordance.initial import InitialPoses, Spread
 from dora.affordance.map import AffordanceMap
@@ -45,15 +45,18 @@ class Settings:
 
     Attributes:
         iterations: gradient steps per candidate.
-        contacts: contact points per candidate: one on the thumb (the first finger), the others on the other
-            fingers in random order, and any finger beyond that.
+        contacts: contact points per candidate: one on the palm, one on the thumb (the first finger), the others on
+            the other fingers in random order, and on any finger beyond that.
         weights: of the energy terms.
         ramp: factor on the weights of penetration, table and self-penetration at the end.
         ramp_start: share of the iterations after which the ramp begins.
         resample: iterations between attempts to draw contact points anew.
         resample_until: share of the iterations after which contact points stay.
         starts: initial poses drawn per candidate; the best is taken.
-        oversampling: candidates searched per candidate asked for; the best are returned.
+        field_size: rows started per candidate; at the share `halving` of the iterations only the best stay.
+        halving: see `field_size`.
+        settle: share of the iterations after which rows that have converged stop.
+        oversampling: candidates finished per candidate asked for; the best are returned.
         translation: largest step of the wrist (m).
         rotation: largest rotation of the wrist in a step (rad).
         joint: largest step of a joint (rad).
@@ -70,6 +73,9 @@ class Settings:
     resample: int = 20
     resample_until: float = 0.6
     starts: int = 6
+    field_size: float = 3.0
+    halving: float = 0.25
+    settle: float = 0.6
     oversampling: float = 1.0
     translation: float = 2e-3
     rotation: float = 0.02
@@ -84,18 +90,46 @@ class Settings:
                 raise InputError(f"the search needs {name} of at least 1, not {getattr(self, name)}.")
 
 
+@dataclass
 class Rows:
-    """Candidates under search: `wrist` (c, 4, 4), `joints` (c, a), `contacts` (c, k), Adam's moments."""
+    """Candidates under search.
 
-    def __init__(self, wrist: Tensor, joints: Tensor, contacts: Tensor) -> None:
-        self.wrist, self.joints, self.contacts = wrist, joints, contacts
-        self.mean = joints.new_zeros(len(joints), 6 + joints.shape[1])
-        self.square = torch.zeros_like(self.mean)
+    `wrist` (c, 4, 4) in the object frame, `joints` (c, a) in rad, `contacts` (c, k) indices of contact points,
+    `mean` and `square` (c, 6 + a) Adam's moments, `total` (c,) energy when last looked at.
+    """
+
+    wrist: Tensor
+    joints: Tensor
+    contacts: Tensor
+    mean: Tensor
+    square: Tensor
+    total: Tensor
+
+    @classmethod
+    def begin(cls, wrist: Tensor, joints: Tensor, contacts: Tensor, total: Tensor) -> Rows:
+        """Rows that have not moved yet."""
+        mean = joints.new_zeros(len(joints), 6 + joints.shape[1])
+        return cls(wrist, joints, contacts, mean, torch.zeros_like(mean), total)
 
     def __len__(self) -> int:
         return len(self.joints)
 
+    def select(self, index: Tensor) -> Rows:
+        """The rows of an index or a mask."""
+        return Rows(*(getattr(self, part.name)[index] for part in fields(self)))
 
+    @staticmethod
+    def join(parts: list[Rows]) -> Rows:
+        """Rows of several parts, in their order."""
+        return Rows(*(torch.cat([getattr(rows, part.name) for rows in parts]) for part in fields(Rows)))
+
+
+CHECK = 5
+"""Iterations between checks for rows that have settled."""
+SETTLED = 2e-3
+"""Relative change of the energy between two checks below which a row has settled."""
+TOLERANCE = 1e-4
+"""Sum of overlaps (m) that a settled row may have, skin included."""
 MEAN_DECAY, SQUARE_DECAY = 0.9, 0.98
 """Adam's decay rates."""
 LAST_STEP = 0.01
@@ -111,43 +145,62 @@ class Search:
         steps = [settings.translation] * 3 + [settings.rotation] * 3 + [settings.joint] * len(hand.lower)
         self._steps = hand.lower.new_tensor(steps)
         parts = hand.contact_part.unique().tolist()
-        self._points = [(hand.contact_part == part).nonzero().squeeze(1) for part in parts if part > 1]
+        self._points = [(hand.contact_part == part).nonzero().squeeze(1) for part in parts]
 
     def run(self, count: int, generator: torch.Generator, progress: Callable[[int], None]) -> Rows:
-        """Search `count` candidates; `progress` gets the number of rows after every iteration."""
-        rows = self.start(count, generator)
-        for step in range(self.settings.iterations):
-            self._step(rows, step, generator)
+        """Search and return `count` candidates; `progress` gets the number of rows after every iteration."""
+        settings, hand = self.settings, self.energy.hand
+        rows = self.start(math.ceil(count * settings.field_size), generator)
+        finished = []
+        halving = int(settings.halving * settings.iterations)
+        for step in range(settings.iterations):
+            found = self._step(rows, step, generator)
             progress(len(rows))
-        hand = self.energy.hand
+            if step == halving:
+                rows = rows.select(found.total.argsort()[:count])
+            elif step > settings.settle * settings.iterations and step % CHECK == 0:
+                settled = self._settled(rows, found)
+                rows.total = found.total
+                finished.append(rows.select(settled))
+                rows = rows.select(~settled)
+                if not len(rows):
+                    break
+        rows = Rows.join([*finished, rows])
         rows.joints = torch.clamp(rows.joints, hand.lower, hand.upper)
         return rows
+
+    def _settled(self, rows: Rows, found: Evaluation) -> Tensor:
+        """Rows (c,) whose energy has stopped falling and whose terms that must vanish have vanished."""
+        still = (rows.total - found.total).abs() < SETTLED * found.total
+        return still & (sum(found.terms.get(name, found.total * 0) for name in RAMPED) < TOLERANCE)
 
     def start(self, count: int, generator: torch.Generator) -> Rows:
         """The best of `starts` initial poses of every candidate."""
         starts = self.settings.starts
         wrist, joints = self.initial.draw(count * starts, generator)
         contacts = self.draw_contacts(count * starts, generator)
-        total = [
-            self.energy(*part).total
-            for part in zip(*(x.split(self.settings.batch) for x in (wrist, joints, contacts)), strict=True)
-        ]
-        best = torch.cat(total).view(starts, count).argmin(0) * count + torch.arange(count)
-        return Rows(wrist[best], joints[best], contacts[best])
+        total = torch.cat(
+            [
+                self.energy(*part).total
+                for part in zip(*(x.split(self.settings.batch) for x in (wrist, joints, contacts)), strict=True)
+            ]
+        )
+        best = total.view(starts, count).argmin(0) * count + torch.arange(count, device=total.device)
+        return Rows.begin(wrist[best], joints[best], contacts[best], total[best])
 
     def draw_contacts(self, count: int, generator: torch.Generator) -> Int[Tensor, "c k"]:
-        """Random contact points: the first finger, then the others in random order, then any."""
-        fingers, contacts = len(self._points), self.settings.contacts
-        others = torch.rand(count, fingers - 1, generator=generator).argsort(1) + 1
-        extra = torch.randint(fingers, (count, contacts), generator=generator)
-        finger = torch.cat((torch.zeros(count, 1, dtype=torch.long), others, extra), 1)[:, :contacts]
+        """Random contact points: palm, first finger, the other fingers in random order, then any finger."""
+        fingers, contacts = len(self._points) - 1, self.settings.contacts
+        others = torch.rand(count, fingers - 1, generator=generator).argsort(1) + 2
+        extra = torch.randint(1, fingers + 1, (count, contacts), generator=generator)
+        part = torch.cat((torch.tensor([[0, 1]]).expand(count, -1), others, extra), 1)[:, :contacts]
         share = torch.rand(count, contacts, generator=generator)
         sizes = torch.tensor([len(points) for points in self._points])
         starts = sizes.cumsum(0) - sizes
-        every = torch.cat(self._points).cpu()
-        return every[starts[finger] + (share * sizes[finger]).long()].to(self._points[0].device)
+        every = torch.cat(self._points)
+        return every[(starts[part] + (share * sizes[part]).long()).to(every.device)]
 
-    def _step(self, rows: Rows, step: int, generator: torch.Generator) -> None:
+    def _step(self, rows: Rows, step: int, generator: torch.Generator) -> Evaluation:
         settings = self.settings
         done = step / settings.iterations
         ramp = 1 + (settings.ramp - 1) * max(0.0, done - settings.ramp_start) / (1 - settings.ramp_start)
@@ -155,6 +208,7 @@ class Search:
         if step and step % settings.resample == 0 and done < settings.resample_until:
             found = self._resample(rows, found, ramp, generator)
         self._descend(rows, found, step)
+        return found
 
     def _resample(self, rows: Rows, found: Evaluation, ramp: float, generator: torch.Generator) -> Evaluation:
         """Draw half of the contact points anew; keep them where the energy is lower."""
@@ -279,7 +333,7 @@ def _candidates(
         position=wrist[:, :3, 3].contiguous(),
         quaternion=quaternion_from_matrix(wrist[:, :3, :3]),
         approach=wrist[:, :3, :3] @ normal,
-        pregrasp=pregrasp(robot, full),
+        pregrasp=opened(energy, wrist, full),
         grasp=squeeze(robot, full),
         grasp_class=tuple(NO_CLASS if label == NO_CONTACT else obj.classes[label] for label in held.tolist()),
         joints=full,
@@ -296,5 +350,34 @@ def _candidates(
     )
 
 
+def opened(
+    energy: GraspEnergy, wrist: Float[Tensor, "c 4 4"], joints: Float[Tensor, "c j"]
+) -> Float[Tensor, "c j"]:
+    """The protocol's open hand, every finger opened only as far as it stays clear of the object behind it.
+
+    Args:
+        energy: knows hand and object.
+        wrist: pose of the wrist in the object frame.
+        joints: all hand joints in contact (rad), in the order of `RobotDescription.hand`.
+    """
+    hand = energy.hand
+    wide = pregrasp(hand.robot, joints)
+    names = [joint for finger in hand.robot.fingers.values() for joint in finger.joints]
+    finger = [next(i for i, f in enumerate(hand.robot.fingers.values()) if n in f.joints) for n in hand.robot.hand.names]
+    assert sorted(names) == sorted(hand.robot.hand.names)
+    share = joints.new_zeros(len(joints), hand.fingers)
+    for trial in OPENINGS:
+        poses = hand.forward(wrist, hand.robot.reduce_hand(torch.lerp(joints, wide, trial)))
+        depth = hand.sphere_radius - energy.field.distance(hand.place(poses, hand.spheres))
+        part = hand.part[hand.spheres.body] - 2
+        deepest = torch.stack([depth[:, part == index].amax(1) for index in range(hand.fingers)], 1)
+        share = torch.where((deepest < OPENING_DEPTH) & (share == trial - OPENINGS[0]), trial, share)
+    return torch.lerp(joints, wide, share[:, finger])
+
+
+OPENINGS = (0.25, 0.5, 0.75, 1.0)
+"""Shares of the protocol's opening that are tried."""
+OPENING_DEPTH = 1e-3
+"""Overlap (m) with the object up to which a finger counts as clear of it."""
 NO_CLASS = "NoContact"
 """Grasp class of a candidate without contact."""

@@ -25,9 +25,11 @@ class Protocol:
 
     Attributes:
         opening: how far the flexing joints are opened before closing [rad].
-        squeeze_proximal: command of the first flexing joint of each finger beyond contact [rad].
-        squeeze_distal: the same of all joints after it [rad].
+        squeeze: command of the flexing joints beyond contact [rad]; the same for all, because equal angles against
+            drives whose stiffness falls towards the fingertip press the tip with about the same force.
         closing_time: time from the open hand to the first gravity [s]; weightless.
+        closing_damping: rate at which the object's velocity decays while the hand closes [1/s]; stands for the
+            friction of what the object rests on, so that the first finger to touch does not throw it.
         ramp: share of the closing time in which the command moves, linearly; it rests for the remainder.
         friction: coefficient between hand and object, of both materials.
         gravity: acceleration along each of `DIRECTIONS` [m/s^2].
@@ -39,9 +41,9 @@ class Protocol:
     """
 
     opening: float = 0.2
-    squeeze_proximal: float = 0.3
-    squeeze_distal: float = 0.2
+    squeeze: float = 0.3
     closing_time: float = 0.5
+    closing_damping: float = 20.0
     ramp: float = 0.7
     friction: float = 0.7
     gravity: float = 9.81
@@ -76,8 +78,7 @@ def pregrasp(
     Returns:
         Commanded joints [rad]; couplings hold.
     """
-    first, later = flexion(robot)
-    return _moved(robot, joints, -protocol.opening * (first + later))
+    return _moved(robot, joints, -protocol.opening * flexion(robot))
 
 
 def squeeze(
@@ -87,29 +88,24 @@ def squeeze(
 
     Arguments and result as in `pregrasp`.
     """
-    first, later = flexion(robot)
-    return _moved(robot, joints, protocol.squeeze_proximal * first + protocol.squeeze_distal * later)
+    return _moved(robot, joints, protocol.squeeze * flexion(robot))
 
 
-def flexion(robot: RobotDescription) -> tuple[np.ndarray, np.ndarray]:
-    """Sense of closing (+1 or -1, else 0) of the first flexing joint of each finger, and of the joints after it.
+def flexion(robot: RobotDescription) -> Float[np.ndarray, " j"]:
+    """Sense in which each hand joint closes: +1 or -1, and 0 for joints that do not flex.
 
-    A finger's first joint spreads it and never flexes if the finger has more than one joint besides its coupled
-    ones. A joint closes towards the limit that is farther from its zero, as straight fingers are zero.
-
-    Returns:
-        Two arrays (n_hand,).
+    A finger's first joint spreads it, unless it is the only one with a drive. The others close towards the limit
+    that is farther from zero, as straight fingers are zero.
     """
     hand, followers = robot.hand, {coupling.follower for coupling in robot.couplings}
     sense = np.where(np.abs(hand.upper) >= np.abs(hand.lower), 1.0, -1.0)
-    first, later = np.zeros(len(hand)), np.zeros(len(hand))
+    found = np.zeros(len(hand))
     for finger in robot.fingers.values():
         index = [hand.names.index(name) for name in finger.joints]
-        driven = [i for i in index if i not in followers]
-        flexing = index[1:] if len(driven) > 1 else index
-        first[flexing[0]] = sense[flexing[0]]
-        later[flexing[1:]] = sense[flexing[1:]]
-    return first, later
+        spreads = sum(i not in followers for i in index) > 1
+        flexing = index[1:] if spreads else index
+        found[flexing] = sense[flexing]
+    return found
 
 
 def _moved(robot: RobotDescription, joints: Tensor, change: np.ndarray) -> Tensor:

@@ -9,6 +9,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
 
+from dora.affordance.hand_mesh import face_colours
+
 OVERSAMPLING = 2
 """Pixels rendered per side of a pixel shown, against jagged edges."""
 DEPTHS = 1 << 40
@@ -65,7 +67,7 @@ def render(
     camera: Camera,
     width: int,
     height: int,
-    background: tuple[int, int, int] = (255,) * 3,
+    background: tuple[int, int, int] = (255, 255, 255),
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Picture of face-coloured meshes with diffuse light, both sides of a face shown.
 
@@ -83,7 +85,7 @@ def render(
     corners = np.concatenate([mesh.triangles for mesh in meshes]) - np.asarray(camera.eye)
     corners = corners @ turn.T
     normals = np.concatenate([mesh.face_normals for mesh in meshes]) @ turn.T
-    colors = np.concatenate([np.asarray(mesh.visual.face_colors)[:, :3] for mesh in meshes]).astype(float)
+    colors = np.concatenate([face_colours(mesh)[:, :3] for mesh in meshes]).astype(float)
     light = np.asarray(LIGHT) / np.linalg.norm(LIGHT)
     facing = np.where(np.einsum("nd,nd->n", normals, corners[:, 0]) > 0, -1.0, 1.0)
     shade = AMBIENT + (1 - AMBIENT) * np.clip(facing * (normals @ light), 0, 1)

@@ -33,6 +33,7 @@ from dora.affordance.ways import (
     Ways,
     attempts,
 )
+from dora.errors import InputError
 from dora.robot import RobotDescription, Shape
 from dora.robot.rotations import (
     matrix_from_quaternion,
@@ -79,10 +80,14 @@ class Reach:
     """Feasibility of candidates for one robot and one kind of object.
 
     Args:
-        robot: arm and hand; motions start from its posture "home".
+        robot: arm and hand.
         obj: has the pieces to keep clear of, in its frame; None for no object.
         base: pose of the robot's base in the world: position [m], quaternion wxyz.
         settings: numbers of the filter.
+        start: name of the robot's posture from which motions start.
+
+    Raises:
+        InputError: the robot has no posture `start`.
     """
 
     def __init__(
@@ -91,13 +96,16 @@ class Reach:
         obj: AffordanceObject | None,
         base: tuple[tuple[float, ...], tuple[float, ...]] = IDENTITY,
         settings: ReachSettings | None = None,
+        start: str = "home",
     ):
+        if start not in robot.postures:
+            raise InputError(f"{robot.name!r} has no posture {start!r}; choose from {', '.join(robot.postures)}.")
         self.robot, self.settings = robot, settings or ReachSettings()
         self.digest = "" if obj is None else obj.digest
         self.base = base
         self.pieces: tuple[Shape | trimesh.Trimesh, ...] = () if obj is None else tuple(p.shape for p in obj.pieces)
-        self.kinematics = InverseKinematics(robot)
-        self.home = torch.tensor(robot.postures["home"].arm, dtype=torch.float32)
+        self.kinematics = InverseKinematics(robot, robot.postures[start].arm)
+        self.start = self.kinematics.start
         self._base_p, self._base_q = (torch.tensor(part, dtype=torch.float32) for part in base)
         up = torch.tensor([0.0, 0.0, 1.0])
         self._normal = quaternion_apply(quaternion_inverse(self._base_q), up)
@@ -131,19 +139,21 @@ class Reach:
         if exact:
             reason[self.hits_object(candidates).repeat(b)] = HAND_OBJECT
         reason[self._hand_height(candidates, goals) < s.table_clearance] = HAND_TABLE
-        arm_q = self.home.repeat(b * c, 1)
+        arm_q = self.start.repeat(b * c, 1)
         standoff_q = arm_q.clone()
-        left = (reason == OK).nonzero()[:, 0]
-        for attempt in attempts(self.kinematics, goals, self.home, s):
-            ways = attempt(left)
-            failure = ways.failure
+        rows = (reason == OK).nonzero()[:, 0]
+        left = torch.arange(len(rows))
+        for attempt in attempts(self.kinematics, goals[rows], self.start, s):
+            if len(left) == 0:
+                break
+            ways, now = attempt(left), rows[left]
             low = self._arm.height(ways.descent, self._normal, self._level).amin(-1) < s.table_clearance
-            failure = torch.where((failure == OK) & low, ARM_COLLISION, failure)
+            failure = torch.where((ways.failure == OK) & low, ARM_COLLISION, ways.failure)
             if exact:
-                failure = self._collisions(candidates, poses, left, ways, failure)
-            better = (failure == OK) | (failure > reason[left])
-            arm_q[left[better]], standoff_q[left[better]] = ways.descent[better, -1], ways.descent[better, 0]
-            reason[left] = torch.where(failure == OK, OK, torch.maximum(reason[left], failure))
+                failure = self._collisions(candidates, poses, now, ways, failure)
+            better = (failure == OK) | (failure > reason[now])
+            arm_q[now[better]], standoff_q[now[better]] = ways.descent[better, -1], ways.descent[better, 0]
+            reason[now] = torch.where(failure == OK, OK, torch.maximum(reason[now], failure))
             left = left[failure != OK]
         dof = arm_q.shape[-1]
         return Reachability(
@@ -175,13 +185,13 @@ class Reach:
         if not self.pieces:
             return hit
         model, s = self._model("hand"), self.settings
-        wrist_p, wrist_q = self.wrist_pose(self.home)
+        wrist_p, wrist_q = self.wrist_pose(self.start)
         # The arm stays; the object moves instead.
         turn = quaternion_multiply(wrist_q.expand(len(candidates), 4), quaternion_inverse(candidates.quaternion))
         steps = torch.arange(0.0, s.standoff + 1e-6, s.spacing / 2)
         offsets = candidates.position[:, None] - candidates.approach[:, None] * steps[:, None]
         places = wrist_p - quaternion_apply(turn[:, None].expand(-1, len(steps), 4), offsets)
-        arm, hands = self.home.double().numpy()[None], candidates.pregrasp.double().numpy()
+        arm, hands = self.start.double().numpy()[None], candidates.pregrasp.double().numpy()
         for i, (quaternion, positions) in enumerate(zip(turn.double().numpy(), places.double().numpy(), strict=True)):
             for position in positions:
                 model.place_object(position, quaternion)
@@ -247,7 +257,7 @@ class Reach:
             return model.free(way.double().numpy(), hand)
         if self.settings.motion == "none":
             return True
-        return plan(model, self.home.double().numpy(), standoff, hand, self.settings.plan) is not None
+        return plan(model, self.start.double().numpy(), standoff, hand, self.settings.plan) is not None
 
     def _model(self, name: Literal["hand", "approach", "transit"]) -> CollisionModel:
         """Collision models by what they test; made when first needed."""

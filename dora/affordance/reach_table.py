@@ -19,6 +19,7 @@ from torch import Tensor
 from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.decomposition import cache_folder
 from dora.affordance.reach import Reach
+from dora.affordance.shipped import data_folder
 from dora.affordance.ways import OK
 from dora.errors import InputError
 from dora.files import read_tensors, write_tensors
@@ -66,21 +67,23 @@ class Grid:
         x, y = (2 * half / (n - 1) if n > 1 else self.spacing for half, n in zip(self.spread, self.shape, strict=False))
         return x, y, 2 * math.pi / self.yaws
 
+    @property
+    def corner(self) -> tuple[float, float]:
+        """x and y of the first node [m]."""
+        x, y = (c - half * (n > 1) for c, half, n in zip(self.centre, self.spread, self.shape, strict=False))
+        return x, y
+
     def nodes(self) -> Float[Tensor, "m 3"]:
         """x, y [m] and yaw [rad] of all nodes, yaw fastest."""
-        axes = [
-            centre - half * (n > 1) + step * torch.arange(n)
-            for centre, half, n, step in zip(self.centre, self.spread, self.shape, self.steps, strict=False)
-        ]
-        yaw = self.steps[2] * torch.arange(self.yaws)
-        return torch.cartesian_prod(*axes, yaw)
+        starts = (*self.corner, 0.0)
+        return torch.cartesian_prod(
+            *(start + step * torch.arange(n) for start, step, n in zip(starts, self.steps, self.shape, strict=True))
+        )
 
     def nearest(self, places: Float[Tensor, "b 3"]) -> tuple[Int[Tensor, " b"], Bool[Tensor, " b"]]:
         """Index of the node nearest to x, y [m] and yaw [rad], and whether the place is within half a cell."""
         steps = places.new_tensor(self.steps)
-        low = places.new_tensor(
-            [c - h * (n > 1) for c, h, n in zip(self.centre, self.spread, self.shape, strict=False)]
-        )
+        low = places.new_tensor(self.corner)
         cell = torch.cat([(places[:, :2] - low), places[:, 2:]], -1) / steps
         index = cell.round().long()
         index[:, 2] %= self.yaws
@@ -119,7 +122,7 @@ class ReachTable:
         cache: Path | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> ReachTable:
-        """Runs the filter at every node, or reads the table from the folder `cache` if it is there already.
+        """Runs the filter at every node, or reads the table if it comes with Dora or is in the folder `cache`.
 
         A run takes about half a millisecond per node and candidate, a reading a few milliseconds.
 
@@ -136,9 +139,11 @@ class ReachTable:
             InputError: Pinocchio or Coal is needed and not installed.
         """
         digest = table_digest(reach, candidates, grid, height, rest)
-        path = (cache or cache_folder()) / f"reach-{digest[:16]}.safetensors"
-        if path.is_file():
-            return cls.load(path, digest, grid, height, rest)
+        name = f"reach-{digest[:16]}.safetensors"
+        path = (cache or cache_folder()) / name
+        for known in (data_folder() / name, path):
+            if known.is_file():
+                return cls.load(known, digest, grid, height, rest)
         nodes, count = grid.nodes(), max(1, CHUNK // len(candidates))
         found = []
         for part in nodes.split(count):
@@ -206,7 +211,7 @@ def table_digest(
     robot = reach.robot
     parts = (reach.settings, reach.base, reach.digest, grid, height, rest, sorted(robot.ignored_pairs))
     digest.update(repr(parts).encode() + hand_digest(robot).encode() + robot.urdf.read_bytes())
-    digest.update(robot.postures["home"].arm.tobytes())
+    digest.update(reach.start.numpy().tobytes())
     for name in ("position", "quaternion", "approach", "pregrasp", "joints"):
         digest.update(getattr(candidates, name).contiguous().cpu().numpy().tobytes())
     return digest.hexdigest()

@@ -14,9 +14,14 @@ ROBOT = "diana7_hit"
 """Robot for which candidates are shipped."""
 
 
+def data_folder() -> Path:
+    """Where the data that come with Dora are."""
+    return Path(str(importlib.resources.files("dora.affordance") / "data"))
+
+
 def shipped_path(name: str) -> Path:
     """Where the shipped candidates of an object are."""
-    return Path(str(importlib.resources.files("dora.affordance") / "data" / f"{name}.safetensors"))
+    return data_folder() / f"{name}.safetensors"
 
 
 def load_candidates(name: str, robot: RobotDescription | None = None) -> GraspCandidates:

@@ -15,6 +15,8 @@ from scipy.optimize import least_squares
 from dora.robot.rotations import quaternion_from_matrix
 from dora.robot.shapes import Shape
 
+AROUND = 24
+"""Divisions around a cylinder or capsule as a mesh."""
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 """Turn (rad) between directions of a spiral that spreads evenly over a sphere."""
 
@@ -69,9 +71,7 @@ def spline(knots: Float[np.ndarray, "k d"], points: int) -> Float[np.ndarray, "m
     return CubicSpline(parameter, knots)(np.linspace(0, parameter[-1], points))
 
 
-def arc(
-    center: tuple[float, float], radius: float, start: float, end: float, points: int
-) -> Float[np.ndarray, "m 2"]:
+def arc(center: tuple[float, float], radius: float, start: float, end: float, points: int) -> Float[np.ndarray, "m 2"]:
     """Points of a circle from one angle (deg) to another."""
     angle = np.radians(np.linspace(start, end, points))
     return np.stack([center[0] + radius * np.cos(angle), center[1] + radius * np.sin(angle)], -1)
@@ -87,7 +87,7 @@ def chamfered_box(size: Sequence[float], chamfer: float, subdivisions: int = 0) 
     return outward(mesh)
 
 
-def capsule_between(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float) -> Shape:
+def capsule_between(start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"], radius: float) -> Shape:
     """The capsule with the centres of its caps at two points."""
     axis = end - start
     length = float(np.linalg.norm(axis))
@@ -108,8 +108,13 @@ def shape_mesh(shape: Shape) -> trimesh.Trimesh:
     elif shape.kind == "sphere":
         mesh = trimesh.creation.icosphere(subdivisions=3, radius=shape.size[0])
     else:
-        create = trimesh.creation.capsule if shape.kind == "capsule" else trimesh.creation.cylinder
-        mesh = create(radius=shape.size[0], height=2 * shape.size[1])
+        radius, height = shape.size[0], 2 * shape.size[1]
+        round_ends = shape.kind == "capsule"
+        mesh = (
+            trimesh.creation.capsule(radius=radius, height=height, count=[AROUND, AROUND])
+            if round_ends
+            else trimesh.creation.cylinder(radius=radius, height=height, sections=AROUND)
+        )
         mesh = trimesh.Trimesh(mesh.vertices[:, [2, 0, 1]], mesh.faces, process=False)
     turn = trimesh.transformations.quaternion_matrix(shape.quaternion)[:3, :3]
     return trimesh.Trimesh(mesh.vertices @ turn.T + shape.position, mesh.faces, process=False)
@@ -155,24 +160,25 @@ def hull_of(points: Float[np.ndarray, "n 3"], vertices: int) -> trimesh.Trimesh:
     return trimesh.convex.convex_hull(hull.vertices[chosen])
 
 
-def unite(parts: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"]]:
-    """The union of watertight parts, and for each of its faces the index of the part that it comes from."""
-    solids = [_manifold(part) for part in parts]
-    result = solids[0]
-    for solid in solids[1:]:
-        result = result + solid
-    raw = result.to_mesh64()
-    origin = {solid.original_id(): index for index, solid in enumerate(solids)}
-    runs = np.diff(raw.run_index) // 3
-    part = np.repeat([origin[i] for i in raw.run_original_id], runs.astype(int))
-    mesh = trimesh.Trimesh(raw.vert_properties[:, :3], raw.tri_verts.astype(np.int64), process=False)
-    return mesh, part.astype(np.int64)
+def unite(
+    parts: Sequence[trimesh.Trimesh],
+) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"], Int[np.ndarray, " f"]]:
+    """The union of watertight parts; for each of its faces the part that it comes from, and the face of that part.
+
+    Raises:
+        ValueError: a part is not closed.
+    """
+    first = manifold3d.Manifold.reserve_ids(len(parts))
+    solids = [_manifold(part, first + index) for index, part in enumerate(parts)]
+    raw = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).to_mesh64()
+    runs = np.diff(raw.run_index).astype(np.int64) // 3
+    part = np.repeat(np.array(raw.run_original_id, np.int64) - first, runs)
+    return _trimesh(raw), part, np.array(raw.face_id, np.int64)
 
 
 def subtract(body: trimesh.Trimesh, tool: trimesh.Trimesh) -> trimesh.Trimesh:
     """The body without what lies inside the tool; both watertight."""
-    raw = (_manifold(body) - _manifold(tool)).to_mesh64()
-    return trimesh.Trimesh(raw.vert_properties[:, :3], raw.tri_verts.astype(np.int64), process=False)
+    return _trimesh((_manifold(body) - _manifold(tool)).to_mesh64())
 
 
 def outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -182,10 +188,21 @@ def outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return mesh
 
 
-def _manifold(mesh: trimesh.Trimesh) -> manifold3d.Manifold:
-    """A mesh in the library of booleans, with an identity that its faces keep."""
-    raw = manifold3d.Mesh64(np.array(mesh.vertices, np.float64, order="C"), np.array(mesh.faces, np.uint64, order="C"))
+def _manifold(mesh: trimesh.Trimesh, identity: int = 0) -> manifold3d.Manifold:
+    """A mesh in the library of booleans; what is left of its faces is found by the identity and their numbers."""
+    raw = manifold3d.Mesh64(
+        np.array(mesh.vertices, np.float64, order="C"),
+        np.array(mesh.faces, np.uint64, order="C"),
+        run_index=np.array([0, 3 * len(mesh.faces)], np.uint64),
+        run_original_id=np.array([identity], np.uint32),
+        face_id=np.arange(len(mesh.faces), dtype=np.uint64),
+    )
     solid = manifold3d.Manifold(raw)
     if solid.status() != manifold3d.Error.NoError:
         raise ValueError(f"not a closed surface: {solid.status()}")
-    return solid.as_original()
+    return solid
+
+
+def _trimesh(raw: manifold3d.Mesh64) -> trimesh.Trimesh:
+    """A result of the library of booleans as a mesh."""
+    return trimesh.Trimesh(raw.vert_properties[:, :3], raw.tri_verts.astype(np.int64), process=False)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from dora.errors import InputError
 from dora.robot.shapes import Shape
@@ -31,7 +31,7 @@ class Piece:
     label: str
     shape: Shape | trimesh.Trimesh
 
-    def moved(self, offset: Float[np.ndarray, "3"]) -> Piece:
+    def moved(self, offset: Float[np.ndarray, " 3"]) -> Piece:
         """The same piece, translated by `offset` (m)."""
         if isinstance(self.shape, Shape):
             x, y, z = (float(v) for v in np.asarray(self.shape.position) + offset)
@@ -90,7 +90,7 @@ class AffordanceObject:
         assert isinstance(part, trimesh.Trimesh)
         return part
 
-    def centroid(self, label: str) -> Float[np.ndarray, "3"]:
+    def centroid(self, label: str) -> Float[np.ndarray, " 3"]:
         """Area-weighted centre of a region (object frame, m); raises InputError as `label_index` does."""
         faces = self.face_labels == self.label_index(label)
         return np.average(self.mesh.triangles_center[faces], axis=0, weights=self.mesh.area_faces[faces])
@@ -139,7 +139,7 @@ def assemble(
     )
 
 
-def moved(mesh: trimesh.Trimesh, offset: Float[np.ndarray, "3"]) -> trimesh.Trimesh:
+def moved(mesh: trimesh.Trimesh, offset: Float[np.ndarray, " 3"]) -> trimesh.Trimesh:
     """A copy of a mesh, translated (m)."""
     return trimesh.Trimesh(mesh.vertices + offset, mesh.faces, process=False)
 
@@ -152,7 +152,7 @@ def support_height(mesh: trimesh.Trimesh, rest: tuple[float, float, float, float
 
 def mass_properties(
     weights: Sequence[tuple[trimesh.Trimesh, float]],
-) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+) -> tuple[float, Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:
     """Mass (kg), centre of mass (3,) (m) and inertia (3, 3) about it (kg m^2) of bodies of uniform density.
 
     Args:
@@ -182,7 +182,7 @@ def surface_digest(mesh: trimesh.Trimesh, face_labels: Int[np.ndarray, " f"], la
     return digest.hexdigest()
 
 
-def _moments(triangles: Float[np.ndarray, "n 3 3"]) -> Int[np.ndarray, "10"]:
+def _moments(triangles: Float[np.ndarray, "n 3 3"]) -> Int[np.ndarray, " 10"]:
     """Rounded area, first and second moments of triangles; edge midpoints integrate quadratics exactly."""
     area = trimesh.triangles.area(triangles) / 3
     middles = (triangles + np.roll(triangles, 1, axis=1)) / 2
@@ -192,8 +192,3 @@ def _moments(triangles: Float[np.ndarray, "n 3 3"]) -> Int[np.ndarray, "10"]:
     values = np.concatenate([[3 * area.sum()], first / total, second[np.triu_indices(3)] / total])
     units = np.repeat([DIGEST_LENGTH, DIGEST_LENGTH, DIGEST_LENGTH], [1, 3, 6])
     return np.round(values / units).astype(np.int64)
-
-
-def faces_where(mask: Bool[np.ndarray, " f"], label: int, otherwise: Int[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-    """Face labels with `label` where `mask` is true."""
-    return np.where(mask, label, otherwise)

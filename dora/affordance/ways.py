@@ -55,7 +55,7 @@ class ReachSettings:
     overlap: float = 0.003
     clearance: float = 0.003
     speed: float = 0.15
-    seeds: int = 4
+    seeds: int = 8
     stride: int = 3
     plan: PlanSettings = field(default_factory=PlanSettings)
 

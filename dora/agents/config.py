@@ -57,7 +57,7 @@ class PPOConfig:
 class SACConfig:
     """Soft actor-critic (Haarnoja et al. 2018) with layer-normalised critics and learned temperature."""
 
-    rollout: int = 8
+    rollout: int = 16
     """Control steps per environment and iteration."""
     batch: int = 512
     """Transitions per gradient step."""
@@ -65,22 +65,30 @@ class SACConfig:
     """Gradient steps per environment step."""
     warmup: int = 4000
     """Environment steps before the first gradient step."""
+    critic_only: int = 500
+    """Gradient steps of the critics before the first one of actor and temperature."""
     capacity: int = 400_000
     """Transitions in the replay buffer."""
     gamma: float = 0.97
     """Discount per control step."""
-    learning_rate: float = 6e-4
-    """Learning rate of actor and critics."""
+    n_step: int = 5
+    """Control steps over which targets sum rewards before they bootstrap."""
+    learning_rate: float = 5e-4
+    """Learning rate of the critics."""
+    learning_rate_actor: float = 3e-4
+    """Learning rate of the actor."""
     learning_rate_alpha: float = 1e-3
     """Learning rate of the temperature."""
-    alpha: float = 0.05
-    """First temperature, in units of reward per nat."""
-    target_entropy: float = -0.5
+    alpha: float = 1e-3
+    """First temperature, in units of mean reward per nat."""
+    target_entropy: float = -1.0
     """Target entropy of the policy, nats per action dimension."""
-    polyak: float = 0.01
+    prior: float = 0.05
+    """Weight of the squared mean action (before the tanh), in units of mean reward: pulls towards no correction."""
+    polyak: float = 0.03
     """Share by which the target critics follow the critics at each gradient step."""
-    log_std: float = -0.5
-    """First logarithm of the exploration noise before the tanh."""
+    log_std_max: float = -1.1
+    """Largest logarithm of the exploration noise before the tanh; a new policy is 0.13 below it."""
     noise_correlation: float = 0.0
     """Correlation of the exploration noise of successive steps, in [0, 1)."""
     hidden: tuple[int, ...] = (256, 256)

@@ -17,6 +17,15 @@ FINAL_SEED = 1_500_000_000  # first episode seed of the evaluation that a result
 Act = Callable[[Float[Tensor, "n o"]], Float[Tensor, "n a"]]
 
 
+def no_correction(action_size: int) -> Act:
+    """A policy whose action is always zero: with guidance it follows the prior."""
+
+    def act(observation: Float[Tensor, "n o"]) -> Float[Tensor, "n a"]:
+        return torch.zeros(len(observation), action_size)
+
+    return act
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """Statistics of evaluation episodes, one row each.

@@ -20,7 +20,8 @@ from torch import Tensor, nn
 CLIP = 6.0  # normalised observations stay within this many standard deviations
 VARIANCE_FLOOR = 1e-4  # keeps components that never change finite
 FIRST_OUTPUT_SCALE = 0.05  # shrinks the last layer of a new actor, so that it starts near zero correction
-SAC_LOG_STD = (-4.0, 0.5)  # range of the state-dependent log standard deviation, before the tanh
+LOG_STD_MIN = -4.0  # smallest state-dependent log standard deviation, before the tanh
+LOG_STD_START = 2.0  # output of a new actor that stands for a log standard deviation 0.13 below its bound
 TANH_MARGIN = 1e-6  # keeps log(1 - tanh^2) finite
 
 
@@ -107,19 +108,24 @@ class GaussianActor(nn.Module):
 
 
 class TanhActor(nn.Module):
-    """Mean and standard deviation from a network, squashed by tanh: the actor of SAC."""
+    """Mean and standard deviation from a network, squashed by tanh: the actor of SAC.
 
-    def __init__(self, observation: int, action: int, hidden: Sequence[int], log_std: float):
+    The log standard deviation is log_std_max - softplus(-x), which keeps a gradient at its bound, and never falls
+    below -4. A new actor is near the bound, so the reward for entropy cannot add noise before critics object.
+    """
+
+    def __init__(self, observation: int, action: int, hidden: Sequence[int], log_std_max: float):
         super().__init__()
+        self.log_std_max = log_std_max
         self.net = mlp((observation, *hidden, 2 * action), nn.ReLU)
         _start_near_zero(self.net)
         with torch.no_grad():
-            last_layer(self.net).bias[action:] = log_std
+            last_layer(self.net).bias[action:] = LOG_STD_START
 
     def forward(self, features: Float[Tensor, "*n o"]) -> tuple[Float[Tensor, "*n a"], Float[Tensor, "*n a"]]:
         """Mean and standard deviation before the tanh."""
-        mean, log_std = self.net(features).chunk(2, -1)
-        return mean, log_std.clamp(*SAC_LOG_STD).exp()
+        mean, raw = self.net(features).chunk(2, -1)
+        return mean, (self.log_std_max - nn.functional.softplus(-raw)).clamp_min(LOG_STD_MIN).exp()
 
     def act(
         self, features: Float[Tensor, "n o"], noise: Float[Tensor, "n a"] | None

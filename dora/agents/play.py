@@ -7,13 +7,13 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from dora.agents.checkpoint import Checkpoint, check_belongs, read_checkpoint, unpack_modules
 from dora.agents.config import RunConfig
 from dora.agents.env import Task, TaskEnv
-from dora.agents.evaluate import FINAL_SEED, Act, Evaluation, evaluate
+from dora.agents.evaluate import FINAL_SEED, Act, Evaluation, evaluate, no_correction
 from dora.agents.learner import make_learner
 from dora.agents.networks import Policy
 from dora.agents.trainer import MakeTask
@@ -56,11 +56,7 @@ def evaluate_checkpoint(
         evaluation = evaluate(env, policy.greedy, config.final_episodes, FINAL_SEED)
         zero = None
         if config.guidance == "affordance":
-
-            def still(observation: Float[Tensor, "n o"]) -> Float[Tensor, "n a"]:
-                return torch.zeros(len(observation), action_size)
-
-            zero = evaluate(env, still, config.final_episodes, FINAL_SEED)
+            zero = evaluate(env, no_correction(action_size), config.final_episodes, FINAL_SEED)
         return checkpoint, evaluation, zero
     finally:
         env.close()

@@ -24,7 +24,6 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
         "eval_every": 25_000,
         "eval_episodes": 50,
         "eval_envs": 50,
-        "learner": {"log_std": -1.2, "target_entropy": -1.0, "learning_rate": 3e-4},
     },
 }
 """Differences from the defaults of `RunConfig`, and under `learner` from those of the learner."""

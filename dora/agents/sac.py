@@ -3,6 +3,7 @@
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -20,14 +21,17 @@ class SAC:
     """Adds each batch to the replay buffer, then takes `updates_per_step` gradient steps per transition.
 
     Observations are stored as they are and normalised when sampled. Truncated episodes bootstrap from their
-    true last observation, because targets look at `terminated` only.
+    true last observation, because targets look at `terminated` only. Rewards are multiplied by 1 - gamma, so that
+    a value is a discounted mean of rewards, whose size does not depend on the horizon. The actor is left alone
+    until the critics have taken `critic_only` gradient steps on data of the first policy, and `prior` times the
+    squared mean correction (before the tanh) is added to its loss.
     """
 
     def __init__(self, config: SACConfig, observation: int, action: int, normaliser_samples: int):
         self.config = config
         self.rollout = config.rollout
         self.normaliser = Normaliser(observation, normaliser_samples)
-        self.actor = TanhActor(observation, action, config.hidden, config.log_std)
+        self.actor = TanhActor(observation, action, config.hidden, config.log_std_max)
         self.policy = Policy(self.normaliser, self.actor, config.noise_correlation)
         self.loss = SACLoss(
             for_loss(self.actor, TanhNormal),
@@ -46,7 +50,7 @@ class SAC:
         self.critic_parameters = _leaves(self.loss.qvalue_network_params)
         log_alpha: Any = self.loss.log_alpha
         self.optimisers: dict[str, torch.optim.Optimizer] = {
-            "actor_adam": torch.optim.Adam(self.actor_parameters, lr=config.learning_rate),
+            "actor_adam": torch.optim.Adam(self.actor_parameters, lr=config.learning_rate_actor),
             "critic_adam": torch.optim.Adam(self.critic_parameters, lr=config.learning_rate),
             "alpha_adam": torch.optim.Adam([log_alpha], lr=config.learning_rate_alpha),
         }
@@ -69,9 +73,9 @@ class SAC:
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Store a batch (N, T), learn from the replay buffer and return the means of the losses by name."""
-        following = ("observation", "reward", "done", "terminated")
-        stored = batch.select("observation", "action", *(("next", name) for name in following))
-        self.replay.extend(stored.reshape(-1).clone())
+        stored = multi_step(batch, self.config.n_step, self.config.gamma)
+        stored["next", "reward"] *= 1 - self.config.gamma
+        self.replay.extend(stored.reshape(-1))
         self.normaliser.update(batch["observation"])
         if self.replay.added < self.config.warmup:
             return {"replay": float(len(self.replay))}
@@ -82,7 +86,7 @@ class SAC:
             self.due -= 1.0
             sample = self._sample()
             critic.append(self._learn_critic(sample))
-            if self.updates % ACTOR_PERIOD == 0:
+            if self.updates >= self.config.critic_only and self.updates % ACTOR_PERIOD == 0:
                 actor.append(self._learn_actor(sample))
             self.target.step()
             self.updates += 1
@@ -90,7 +94,7 @@ class SAC:
         if critic:
             values["qvalue"] = float(torch.stack(critic).mean())
         if actor:
-            names = ("actor", "alpha", "entropy")
+            names = ("actor", "alpha", "entropy", "action_std", "correction")
             values |= dict(zip(names, torch.stack(actor).mean(0).tolist(), strict=True))
         return values
 
@@ -112,11 +116,42 @@ class SAC:
 
     def _learn_actor(self, sample: TensorDict) -> Tensor:
         loss, metadata = self.loss.actor_loss(sample)
-        _descend(self.optimisers["actor_adam"], loss)
+        mean, std = self.actor(sample["features"])
+        _descend(self.optimisers["actor_adam"], loss + self.config.prior * mean.square().sum(-1).mean())
         log_prob = metadata["log_prob"]
         alpha_loss = self.loss.alpha_loss(log_prob).mean()
         _descend(self.optimisers["alpha_adam"], alpha_loss)
-        return torch.stack([loss.detach(), self._alpha(), -log_prob.mean()])
+        size = mean.detach().tanh().square().mean().sqrt()
+        return torch.stack([loss.detach(), self._alpha(), -log_prob.mean(), std.detach().mean(), size])
+
+
+def multi_step(batch: TensorDictBase, steps: int, gamma: float) -> TensorDict:
+    """Transitions over up to `steps` control steps, from a batch (N, T) of single ones.
+
+    The reward is sum_k gamma^k r_(t+k) over k < n, where n is `steps` or less if the episode or the batch ends
+    before; `next` is what follows the n-th step, and `steps_to_next_obs` (N, T, 1) is n. (TorchRL's `MultiStep`
+    keeps the `terminated` of the first step and would bootstrap beyond a failure.)
+    """
+    rows, length = batch.shape
+    reward, done = batch["next", "reward"], batch["next", "done"]
+    total: Float[Tensor, "n t 1"] = reward.clone()
+    last = torch.arange(length).expand(rows, length).clone()
+    going = ~done
+    for k in range(1, min(steps, length)):
+        more = going[:, :-k]
+        total[:, :-k] += gamma**k * reward[:, k:] * more
+        last[:, :-k] += more[..., 0]
+        going[:, :-k] &= ~done[:, k:]
+    following = batch["next"].select("observation", "done", "terminated")[torch.arange(rows)[:, None], last]
+    return TensorDict(
+        {
+            "observation": batch["observation"].clone(),
+            "action": batch["action"].clone(),
+            "steps_to_next_obs": (last - torch.arange(length) + 1)[..., None],
+            "next": following.set("reward", total),
+        },
+        batch_size=batch.shape,
+    )
 
 
 def _leaves(parameters: Any) -> list[Any]:

@@ -25,7 +25,7 @@ from dora.agents.checkpoint import (
 from dora.agents.collect import Rollouts
 from dora.agents.config import RunConfig
 from dora.agents.env import EpisodeColumns, Task, TaskEnv, ended_episodes
-from dora.agents.evaluate import FINAL_SEED, PERIODIC_SEED, Evaluation, evaluate
+from dora.agents.evaluate import FINAL_SEED, PERIODIC_SEED, Evaluation, evaluate, no_correction
 from dora.agents.interrupt import Interrupt
 from dora.agents.learner import Learner, make_learner
 from dora.agents.logging import RunLog
@@ -235,9 +235,6 @@ class Trainer:
     def _greedy(self, observation: Float[Tensor, "n o"]) -> Float[Tensor, "n a"]:
         return self.learner.policy.greedy(observation)
 
-    def _zero(self, observation: Float[Tensor, "n o"]) -> Float[Tensor, "n a"]:
-        return torch.zeros(len(observation), self.sizes[1])
-
     def _run_evaluation(
         self,
         episodes: int,
@@ -264,7 +261,7 @@ class Trainer:
         evaluation = self._run_evaluation(episodes, FINAL_SEED, self._greedy, interrupt)
         zero = None
         if self.config.guidance == "affordance":
-            zero = self._run_evaluation(episodes, FINAL_SEED, self._zero, interrupt)
+            zero = self._run_evaluation(episodes, FINAL_SEED, no_correction(self.sizes[1]), interrupt)
         self._spend("evaluate", time.perf_counter() - start)
         return evaluation, zero
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,9 +26,8 @@ ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "penetration, median / p90 / max": lambda r: _lengths(r["penetration_mm"]),
     "self-penetration, median / p90 / max": lambda r: _lengths(r["self_penetration_mm"]),
     "classes of the valid": lambda r: ", ".join(f"{n} {c}" for n, c in r["classes"].items()) or "-",
-    "energy, medians": lambda r: ", ".join(f"{n} {v:.3g}" for n, v in r["energy"].items()),
 }
-"""Rows of the printed table."""
+"""Rows of the printed table, followed by the medians of the energy terms."""
 
 
 def print_report(report: dict[str, Any], console: Console | None = None) -> None:
@@ -40,6 +39,8 @@ def print_report(report: dict[str, Any], console: Console | None = None) -> None
         table.add_column(name.replace("_", " "), overflow="fold")
     for name, cell in ROWS.items():
         table.add_row(name, *(cell(column) for column in (report, *baselines.values())))
+    for name in report["energy"]:
+        table.add_row(f"energy: {name}", *(f"{column['energy'][name]:.3g}" for column in (report, *baselines.values())))
     (console or Console()).print(table)
 
 
@@ -53,10 +54,11 @@ def check_out(out: Path) -> None:
         raise InputError(f"--out is {out}: give a name that ends in {SUFFIX}.")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=out.parent).close()
     except OSError as error:
-        raise InputError(f"Cannot make the folder {out.parent} ({error.strerror}): choose another --out.") from error
-    if not os.access(out.parent, os.W_OK) or out.is_dir():
-        raise InputError(f"Cannot write {out}: choose another --out.")
+        raise InputError(f"Cannot write into {out.parent} ({error.strerror}): choose another --out.") from error
+    if out.is_dir():
+        raise InputError(f"--out is {out}, which is a folder: choose another name.")
 
 
 def write_report(report: dict[str, Any], candidates: GraspCandidates, out: Path) -> None:

@@ -36,7 +36,7 @@ class Generated:
 
     Attributes:
         candidates: all that the search gave; `valid` if they passed the simulation (when there was one) and stay
-            below the protocol's penetration.
+            below the protocol's penetration; without a simulation, if they touch and stay below it.
         requested: number asked for.
         region: label asked for, None for a free search.
         seed: of the search.
@@ -77,7 +77,7 @@ def generate(
         seed: of all random draws.
         region: label to be held; None leaves it open.
         phases: where progress is shown.
-        simulate: whether to validate in SAPIEN; otherwise only the penetration decides.
+        simulate: whether to validate in SAPIEN; otherwise penetration and touch decide.
         settings: of the search.
         protocol: of the validation.
         name: of this run, for the progress.
@@ -90,21 +90,15 @@ def generate(
     report = phases.phase(f"{name}: search", "candidates", scale=1 / settings.iterations)
     found = optimise(obj, robot, num, seed, region, settings, progress=report)
     between = time.perf_counter()
-    shallow = found.penetration <= protocol.penetration
     passed = strict = None
     if simulate:
-        verdict = validate(
-            found, obj, robot, protocol, progress=phases.phase(f"{name}: simulation", "candidates")
-        )
-        passed = verdict.passed
-        strict = (
-            (passed & shallow)
-            & (found.self_penetration < protocol.strict_self_penetration)
-            & (verdict.closing_shift < protocol.strict_shift)
-        )
+        verdict = validate(found, obj, robot, protocol, progress=phases.phase(f"{name}: simulation", "candidates"))
+        passed, valid, strict = verdict.passed, verdict.valid, verdict.strict
+    else:
+        valid = (found.penetration <= protocol.penetration) & (found.contact_finger > 0).any(1)
     end = time.perf_counter()
-    origin = {"search": found.settings, "region": region, "seed": seed, "protocol": repr(protocol) if simulate else None}
-    valid = shallow if passed is None else shallow & passed
+    judged = repr(protocol) if simulate else None
+    origin = {"search": found.settings, "region": region, "seed": seed, "protocol": judged}
     candidates = replace(found, valid=valid, settings=json.dumps(origin))
     return Generated(candidates, num, region, seed, between - start, end - between, passed, strict)
 

@@ -1,20 +1,21 @@
 """How a hand grips an object: contacts of one physics step between the parts of a hand and one body."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import sapien
 
 
 @dataclass(frozen=True)
 class Grip:
-    """Contact points of k touching pairs of shapes, world frame.
+    """Contact points between hand and object.
 
     Attributes:
         part: (k,) hand part of each point.
         force: (k,) magnitude of the impulse over the length of the step [N].
-        point: (k, 3) [m].
+        point: (k, 3) in the world frame, or in that of `seen_from` [m].
         depth: deepest overlap over all points [m]; 0 if none overlap.
     """
 
@@ -32,6 +33,11 @@ class Grip:
         """Sum of the magnitudes per hand part, (parts,) [N]."""
         return np.bincount(self.part, self.force, parts)
 
+    def seen_from(self, frame: sapien.Pose) -> "Grip":
+        """The same with points in a frame whose pose in the world is given."""
+        matrix = frame.inv().to_transformation_matrix()
+        return replace(self, point=self.point @ matrix[:3, :3].T + matrix[:3, 3])
+
 
 class GripReader:
     """Reads the contacts between one body and a hand.
@@ -43,9 +49,7 @@ class GripReader:
         timestep: length of a physics step [s].
     """
 
-    def __init__(
-        self, contacts: Callable[[], list], body: Any, part_of: Mapping[int, int], timestep: float
-    ):
+    def __init__(self, contacts: Callable[[], list], body: Any, part_of: Mapping[int, int], timestep: float):
         self._contacts, self._body, self._part_of, self._timestep = contacts, body, part_of, timestep
 
     def read(self) -> Grip:

@@ -78,27 +78,35 @@ class FloatingHand:
         self.part_of = {id(body): part_of[name] for name, body in self._bodies.items()}
 
     def _set_drives(self, robot: RobotDescription) -> None:
-        joints = {joint.name: joint for joint in self.articulation.active_joints}
-        self._order = [joint.name for joint in self.articulation.active_joints]
+        active = self.articulation.active_joints
+        joints = {joint.name: joint for joint in active}
         self._slides = [joints[name] for name in _SLIDES if name in joints]
+        self._joints = [joints[name] for name in robot.hand.names]
+        place = {joint.name: index for index, joint in enumerate([*self._slides, *self._joints])}
+        self._order = [place[joint.name] for joint in active]
+        """Per joint of the articulation: its index in slides followed by hand joints."""
         for slide in self._slides:
             slide.set_drive_properties(CARRIAGE_STIFFNESS, CARRIAGE_DAMPING, CARRIAGE_FORCE, "force")
-        self._joints = [joints[name] for name in robot.hand.names]
         hand = robot.hand
         for i, joint in enumerate(self._joints):
             joint.set_drive_properties(hand.stiffness[i], hand.damping[i], hand.effort[i], "force")
             joint.set_armature(np.array([hand.armature[i]], np.float32))
-        self._place = {name: i for i, name in enumerate(robot.hand.names)}
 
-    def reset(self, joints: np.ndarray, root: sapien.Pose | None = None) -> None:
-        """Puts the hand at rest: joints (20,) [rad], slides in the middle, the root's pose in the world."""
+    def reset(self, joints: np.ndarray, root: sapien.Pose | None = None, offset: np.ndarray | None = None) -> None:
+        """Puts the hand at rest and commands it to stay.
+
+        Args:
+            joints: (20,) [rad].
+            root: pose of the root in the world; stays if None.
+            offset: (3,) of the palm from the root, in the root's frame [m]; only on a carriage, 0 if None.
+        """
         if root is not None:
             self.articulation.set_root_pose(root)
-        values = [joints[self._place[name]] if name in self._place else 0.0 for name in self._order]
-        self.articulation.set_qpos(np.array(values, np.float32))
-        self.articulation.set_qvel(np.zeros(len(values), np.float32))
+        slides = np.zeros(len(self._slides)) if offset is None else offset
+        self.articulation.set_qpos(np.concatenate([slides, joints])[self._order].astype(np.float32))
+        self.articulation.set_qvel(np.zeros(len(self._order), np.float32))
         self.command(joints)
-        self.move([0.0] * len(self._slides))
+        self.move(slides.tolist())
 
     def command(self, joints: np.ndarray) -> None:
         """Sends the drives towards joints (20,) [rad]."""
@@ -110,13 +118,12 @@ class FloatingHand:
         for slide, value in zip(self._slides, offset, strict=True):
             slide.set_drive_target(value)
 
-    def slide_to(self, offset: list[float]) -> None:
-        """Puts the slides at an offset (3,) [m] at once, and leaves them there; the fingers stay as they are."""
+    @property
+    def lag(self) -> float:
+        """Distance of the palm from where the slides were sent [m]."""
         qpos = self.articulation.qpos
-        for name, value in zip(_SLIDES, offset, strict=True):
-            qpos[self._order.index(name)] = value
-        self.articulation.set_qpos(qpos)
-        self.move(offset)
+        ahead = [slide.drive_target[0] - qpos[self._order.index(i)] for i, slide in enumerate(self._slides)]
+        return float(np.linalg.norm(ahead))
 
 
 _SLIDES = ("slide_x", "slide_y", "slide_z")

@@ -9,19 +9,28 @@ pose is the pose that the *hammer* shall have, times the inverse of that.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dora.robot.rotations import quaternion_from_rotation_vector, quaternion_inverse, quaternion_multiply
-from dora.robot.rotations import rotation_angle, rotation_vector_from_quaternion
+from dora.robot.rotations import (
+    quaternion_apply,
+    quaternion_from_rotation_vector,
+    quaternion_inverse,
+    quaternion_multiply,
+    rotation_angle,
+    rotation_vector_from_quaternion,
+)
 from dora.tasks.correction import Target
-from dora.tasks.hammering import Pose, Strike, blend, compose, inverse, predict_goal, relative, slew
+from dora.tasks.hammering import Pose, Strike, arrival, blend, compose, fallen, inverse, relative, slew, slid
+from dora.tasks.nail import DRIVEN
 from dora.tasks.reference import Reference
 from dora.tasks.hammer_snapshot import HammerSnapshot
 from dora.tasks.stages import Stage
 
-LEAD = 0.087
-"""Time before the predicted arrival at which the fingers start to close [s]."""
+LEAD = 0.10
+"""Time from the beginning of the catch until the fingers hold the handle [s]."""
+SINK = 0.10
+"""How far the hand sinks in that time [m]."""
 FOLLOW_SPEED = 1.2
 """Speed up to which the closing hand sinks with the hammer [m/s]."""
 FOLLOW_TIME = 0.15
@@ -30,6 +39,10 @@ FOLLOW_UP, FOLLOW_DOWN = 30.0, 10.0
 """Acceleration and deceleration of that [m/s^2]."""
 FINGER_LAG = 0.025
 """Time from the beginning of the sinking to the command to close [s]."""
+TRACK_TIME = 0.07
+"""How long the closing hand goes on following the handle sideways [s]."""
+AHEAD = 0.04
+"""How far ahead of time the hand is where the handle will be [s]."""
 CLOSE_TIME = 0.35
 """From the command to close until the hand counts as closed [s]."""
 SETTLE_TIME = 0.35
@@ -46,7 +59,7 @@ ALIGN_TIME = 0.4
 """How long the hammer is held there, in place [s]."""
 RAISE = 0.7
 """Angle by which the hammer is raised before a blow [rad]."""
-THROUGH = 0.008
+THROUGH = 0.003
 """How far below the nail's head a blow is aimed [m]."""
 SWING_SPIN = 4.5
 """Angular speed of the hammer at impact [rad/s]."""
@@ -62,12 +75,14 @@ PATIENCE = 1.5
 
 @dataclass(frozen=True)
 class Timing:
-    """What the phases look at, each (n,): time to arrival and in the phase [s], the wrist's errors [m], [rad]."""
+    """What the phases look at, each (n,): time to arrival and in the phase [s], the wrist's errors [m], [rad], and
+    whether the nail has been driven in."""
 
     arrival: Float[Tensor, " n"]
     spent: Float[Tensor, " n"]
     position: Float[Tensor, " n"]
     angle: Float[Tensor, " n"]
+    driven: Bool[Tensor, " n"]
 
 
 def _none(t: Timing) -> Tensor:
@@ -76,6 +91,10 @@ def _none(t: Timing) -> Tensor:
 
 def _there(t: Timing) -> Tensor:
     return ((t.position < NEAR[0]) & (t.angle < NEAR[1])) | (t.spent > PATIENCE)
+
+
+def _struck(t: Timing) -> Tensor:
+    return t.spent >= SWING_TIME + DWELL
 
 
 SWING_TIME = 2 * RAISE / SWING_SPIN
@@ -87,9 +106,10 @@ PHASES: list[Stage[Timing]] = [
     Stage("settle", _none, lambda t: t.spent >= SETTLE_TIME),
     Stage("align", _none, lambda t: _there(t) & (t.spent >= ALIGN_TIME), hold=12),
     Stage("raise", _none, _there, hold=2),
-    Stage("swing", _none, lambda t: t.spent < 0, lost=lambda t: t.spent >= SWING_TIME + DWELL, back_to="raise"),
+    Stage("swing", _none, lambda t: _struck(t) & t.driven, lost=lambda t: _struck(t) & ~t.driven, back_to="raise"),
+    Stage("rest", _none, lambda t: t.spent < 0),
 ]
-WAIT, CLOSE, SETTLE, ALIGN, RAISING, SWING = range(6)
+WAIT, CLOSE, SETTLE, ALIGN, RAISING, SWING, REST = range(7)
 
 
 class CatchReference(Reference):
@@ -115,7 +135,7 @@ class CatchReference(Reference):
         identity = torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(num_envs, 1)
         self.buffers = {
             "home_p": zeros(3), "home_q": identity.clone(), "lead_p": zeros(3), "lead_q": identity.clone(),
-            "held_p": zeros(3), "held_q": identity.clone(), "spent": zeros(), "sinking": zeros(),
+            "held_p": zeros(3), "held_q": identity.clone(), "spent": zeros(), "sinking": zeros(), "depth": zeros(),
         }  # fmt: skip
 
     def begin(self, rows: Int[Tensor, " b"], wrist_p: Float[Tensor, "b 3"], wrist_q: Float[Tensor, "b 4"]) -> None:
@@ -123,27 +143,39 @@ class CatchReference(Reference):
         b = self.buffers
         for name in ("home", "lead"):
             b[f"{name}_p"][rows], b[f"{name}_q"][rows] = wrist_p, wrist_q
-        for name in ("held_p", "spent", "sinking"):
+        for name in ("held_p", "spent", "sinking", "depth"):
             b[name][rows] = 0.0
         self.phase.reset(rows)
 
-    def _arrival(self, s: HammerSnapshot) -> tuple[Tensor, Tensor, Tensor]:
-        """Time (n,) until the candidate comes down to the hand's height [s], and the wrist pose to wait in."""
+    def _arrival(self, s: HammerSnapshot) -> Tensor:
+        """Time (n,) until the candidate comes down to the height at which the fingers are to hold it [s]."""
+        body = s.object_p, s.object_q
+        carried, _ = relative(body, (s.goal_p, s.goal_q))
+        return arrival(body, s.object_v, s.object_w, carried, self.buffers["home_p"][:, 2] - SINK)
+
+    def _meeting(self, s: HammerSnapshot, height: Tensor) -> Pose:
+        """Wrist pose at a height that has the handle where the candidate has it, a moment from now.
+
+        The candidate is moved along the handle: a tilted handle that falls straight down shifts sideways.
+        """
         b = self.buffers
-        home_p, home_q = b["home_p"], b["home_q"]
-        body, goal = (s.object_p, s.object_q), (s.goal_p, s.goal_q)
-        time, position, quaternion = predict_goal(body, s.object_v, s.object_w, goal, home_p[:, 2])
+        soon = fallen((s.object_p, s.object_q), s.object_v, s.object_w, self._arrival(s).clamp(max=AHEAD))
+        goal = compose(soon, relative((s.object_p, s.object_q), (s.goal_p, s.goal_q)))
+        axis = quaternion_apply(soon[1], torch.tensor([0.0, 0.0, 1.0], device=height.device).expand_as(s.object_p))
+        position, quaternion = slid(goal, axis, height)
+        home_p, home_q = b["home_p"].clone(), b["home_q"]
+        home_p[:, 2] = height
         position = home_p + torch.clamp(position - home_p, -self._reach, self._reach)
         turn = rotation_vector_from_quaternion(quaternion_multiply(quaternion, quaternion_inverse(home_q)))
         turn = turn * (TURN / turn.norm(dim=-1, keepdim=True).clamp(min=TURN))
-        return time, position, quaternion_multiply(quaternion_from_rotation_vector(turn), home_q)
+        return position, quaternion_multiply(quaternion_from_rotation_vector(turn), home_q)
 
     def target(self, s: HammerSnapshot) -> Target:
         """Where the candidate will be, until the fingers close; then where the reference has been led."""
         b, phase = self.buffers, self.phase.index
         waits = (phase == WAIT)[:, None]
         opened = waits | ((phase == CLOSE) & (b["spent"] < FINGER_LAG))[:, None]
-        _, position, quaternion = self._arrival(s)
+        position, quaternion = self._meeting(s, b["home_p"][:, 2])
         return Target(
             torch.where(waits, position, b["lead_p"]),
             torch.where(waits, quaternion, b["lead_q"]),
@@ -153,36 +185,43 @@ class CatchReference(Reference):
     def advance(self, s: HammerSnapshot) -> None:
         """Moves phase, measurement and lead on, once per control step."""
         b, before = self.buffers, self.phase.index.clone()
-        arrival, wait_p, wait_q = self._arrival(s)
+        self._measure(s, before)
         b["spent"] += self.dt
-        error = (b["lead_p"] - s.wrist_p).norm(dim=-1), rotation_angle(b["lead_q"], s.wrist_q)
-        self.phase.advance(Timing(arrival, b["spent"], *error))
+        goal = self._carried_to(before)
+        error = (goal[0] - s.wrist_p).norm(dim=-1), rotation_angle(goal[1], s.wrist_q)
+        self.phase.advance(Timing(self._arrival(s), b["spent"], *error, s.nail_driven >= DRIVEN))
         now = self.phase.index
         b["spent"].masked_fill_(now != before, 0.0)
-        self._measure(s, now)
-        held: Pose = (b["held_p"], b["held_q"])
         lead = b["lead_p"], b["lead_q"]
-        for phase, (position, quaternion) in {
-            WAIT: (wait_p, wait_q),
-            CLOSE: self._giving_way(lead),
-            ALIGN: self._carried(lead, self._wrist(s, 0.0, GAP, held)),
-            RAISING: self._carried(lead, self._wrist(s, RAISE, -THROUGH, held)),
-            SWING: self._wrist(s, self._swung(), -THROUGH, held),
-        }.items():
-            here = (now == phase)[:, None]
+        carried = slew(lead, self._carried_to(now), CARRY_SPEED * self.dt, CARRY_SPIN * self.dt)
+        for phases, (position, quaternion) in (
+            ((WAIT,), self._meeting(s, b["home_p"][:, 2])),
+            ((CLOSE,), self._sinking(s, lead)),
+            ((ALIGN, RAISING, REST), carried),
+            ((SWING,), self._wrist(self._swung(), -THROUGH)),
+        ):
+            here = torch.isin(now, torch.tensor(phases, device=now.device))[:, None]
             b["lead_p"].copy_(torch.where(here, position, b["lead_p"]))
             b["lead_q"].copy_(torch.where(here, quaternion, b["lead_q"]))
 
-    def _measure(self, s: HammerSnapshot, now: Tensor) -> None:
-        """Follows the hammer's pose in the hand: at once while it is caught, smoothly after, not while it strikes."""
+    def _carried_to(self, phase: Tensor) -> Pose:
+        """Wrist pose to which the hammer is carried in a phase: low over the nail, raised for a blow, or at rest."""
+        raised = RAISE * (phase == RAISING)
+        gap = torch.where(phase == RAISING, -THROUGH, torch.where(phase == REST, 2 * GAP, GAP))
+        return self._wrist(raised, gap)
+
+    def _measure(self, s: HammerSnapshot, phase: Tensor) -> None:
+        """Follows the hammer's pose in the hand: at once while it is caught, smoothly after, not while it strikes;
+        and the nail's depth, not while it is struck, or the blow would become a push."""
         b = self.buffers
-        share = torch.where(now <= CLOSE, 1.0, torch.where(now == SWING, 0.0, MEMORY))
+        b["depth"].copy_(torch.where(phase == SWING, b["depth"], s.nail_depth))
+        share = torch.where(phase <= CLOSE, 1.0, torch.where(phase == SWING, 0.0, MEMORY))
         seen = relative((s.wrist_p, s.wrist_q), (s.object_p, s.object_q))
         held_p, held_q = blend((b["held_p"], b["held_q"]), seen, share)
         b["held_p"].copy_(held_p)
         b["held_q"].copy_(held_q)
 
-    def _giving_way(self, lead: Pose) -> Pose:
+    def _sinking(self, s: HammerSnapshot, lead: Pose) -> Pose:
         """The lead, sinking with the hammer for a moment, so that the fingers have time to close around it."""
         b = self.buffers
         faster, slower = b["sinking"] + FOLLOW_UP * self.dt, b["sinking"] - FOLLOW_DOWN * self.dt
@@ -190,18 +229,17 @@ class CatchReference(Reference):
         b["sinking"].copy_(torch.where(self.phase.index == CLOSE, speed, 0.0))
         down = torch.zeros_like(lead[0])
         down[:, 2] = b["sinking"] * self.dt
-        return lead[0] - down, lead[1]
-
-    def _carried(self, lead: Pose, goal: Pose) -> Pose:
-        return slew(lead, goal, CARRY_SPEED * self.dt, CARRY_SPIN * self.dt)
+        position = lead[0] - down
+        met_p, met_q = self._meeting(s, position[:, 2])
+        free = (b["spent"] < TRACK_TIME)[:, None]
+        return torch.where(free, met_p, position), torch.where(free, met_q, lead[1])
 
     def _swung(self) -> Tensor:
         """Angle (n,) of the hammer in the next step of a swing: constant acceleration from RAISE to 0 [rad]."""
         share = ((self.buffers["spent"] + self.dt) / SWING_TIME).clamp(max=1)
         return RAISE * (1 - share.square())
 
-    def _wrist(self, s: HammerSnapshot, raised: Tensor | float, gap: float, held: Pose) -> Pose:
+    def _wrist(self, raised: Tensor, gap: Tensor | float) -> Pose:
         """Wrist pose that brings the held hammer there."""
-        depth = s.nail_depth
-        angle = torch.as_tensor(raised, device=depth.device).expand_as(depth)
-        return compose(self.strike.hammer(depth, angle, gap), inverse(held))
+        b = self.buffers
+        return compose(self.strike.hammer(b["depth"], raised, gap), inverse((b["held_p"], b["held_q"])))

@@ -5,7 +5,6 @@ from the number of the control step. So they neither depend on the other environ
 and a restored state sees the same noise as the one that was saved.
 """
 
-from dataclasses import replace
 from math import pi
 
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor
 from dora.robot.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.tasks.choice import Choice
 from dora.tasks.presets import Preset
-from dora.tasks.snapshot import Snapshot
+from dora.tasks.snapshot import S, observed
 
 KEYS = 2**24
 """Number of different keys; each is exact in a float, as which states are stored."""
@@ -85,7 +84,7 @@ class Disturbances:
         angle = 2 * pi * where
         return torch.stack([size * angle.cos(), size * angle.sin(), torch.zeros_like(size)], -1)
 
-    def seen(self, s: Snapshot, choice: Choice, step: Int[Tensor, " n"]) -> Snapshot:
+    def seen(self, s: S, choice: Choice, step: Int[Tensor, " n"]) -> S:
         """The state as it is observed: object pose, all that follows from it, and hand joints are noisy."""
         preset = self.preset
         if not preset.noisy:
@@ -95,7 +94,7 @@ class Disturbances:
         tilt = quaternion_from_rotation_vector(preset.seen_rotation * error[:, 3:6])
         quaternion = quaternion_multiply(s.object_q, tilt)
         near_p, near_q, approach = choice.goals(position, quaternion)
-        return replace(
+        return observed(
             s,
             object_p=position, object_q=quaternion, hand_q=s.hand_q + preset.seen_joint * error[:, 6:],
             near_p=near_p, near_q=near_q, goal_p=near_p[:, 0], goal_q=near_q[:, 0], goal_approach=approach,

@@ -41,7 +41,7 @@ from dora.tasks.hammer_snapshot import (
     tip_distance,
 )
 from dora.tasks.hammering import Strike, relative
-from dora.tasks.nail import Nail
+from dora.tasks.nail import DRIVEN, Nail
 from dora.tasks.observations import Entry
 from dora.tasks.reference import Reference
 from dora.tasks.rewards import Term, Terms, closeness
@@ -79,8 +79,6 @@ ABOVE = 0.015
 """Horizontal distance of the striking face from the nail up to which it is above the nail [m]."""
 HEIGHT = (-0.005, 0.15)
 """Height of the face above the nail between which it counts as above [m]."""
-DRIVEN = 0.010
-"""How far blows must drive the nail [m]."""
 HOLD = 10
 """Control steps the hammer must be held over the nail."""
 DROPPED = 0.12

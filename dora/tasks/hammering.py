@@ -26,6 +26,8 @@ GRAVITY = 9.81
 """[m/s^2]"""
 LATEST = 1.0
 """Longest fall that is predicted [s]."""
+STEEP = 0.5
+"""Vertical part of a handle's axis below which it is not followed any more."""
 ROUNDS = 2
 """Fixed-point iterations of the time of arrival; the spin between them is small."""
 
@@ -59,38 +61,41 @@ def fall_time(height: Float[Tensor, " n"], speed: Float[Tensor, " n"]) -> Float[
     return torch.where(square > 0, time, 0.0).clamp(0, LATEST)
 
 
-def predict_goal(
-    body: Pose,
-    velocity: Float[Tensor, "n 3"],
-    spin: Float[Tensor, "n 3"],
-    goal: Pose,
-    height: Float[Tensor, " n"],
-) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
-    """When a falling body's goal comes down to a height, and its pose then.
-
-    Free fall p + v t - g t^2 / 2 with constant spin, exp(w t) q.
-
-    Args:
-        body: pose now.
-        velocity: of its centre of mass [m/s].
-        spin: angular velocity [rad/s].
-        goal: pose now of what moves with the body, such as the wrist pose of a grasp candidate.
-        height: height of the goal's origin that is waited for [m].
-
-    Returns:
-        Time [s], position [m] and orientation of the goal at that time.
-    """
-    carried = relative(body, goal)
-    time, turned = torch.zeros_like(height), body[1]
-    for _ in range(ROUNDS):
-        turned = quaternion_multiply(quaternion_from_rotation_vector(spin * time[:, None]), body[1])
-        lever = quaternion_apply(turned, carried[0])[:, 2]
-        time = fall_time(body[0][:, 2] + lever - height, velocity[:, 2])
+def fallen(body: Pose, velocity: Float[Tensor, "n 3"], spin: Float[Tensor, "n 3"], time: Float[Tensor, " n"]) -> Pose:
+    """Pose of a free body after a time [s]: p + v t - g t^2 / 2 and exp(w t) q, with constant spin [rad/s]."""
     t = time[:, None]
     drop = torch.zeros_like(velocity)
     drop[:, 2] = GRAVITY * time.square() / 2
-    position, quaternion = compose((body[0] + velocity * t - drop, turned), carried)
-    return time, position, quaternion
+    return body[0] + velocity * t - drop, quaternion_multiply(quaternion_from_rotation_vector(spin * t), body[1])
+
+
+def arrival(
+    body: Pose,
+    velocity: Float[Tensor, "n 3"],
+    spin: Float[Tensor, "n 3"],
+    carried: Float[Tensor, "n 3"],
+    height: Float[Tensor, " n"],
+) -> Float[Tensor, " n"]:
+    """Time [s] until a point of a falling body comes down to a height.
+
+    Args:
+        body: pose now; its origin is the centre of mass.
+        velocity: of the centre of mass [m/s].
+        spin: angular velocity [rad/s].
+        carried: the point, in the body's frame [m].
+        height: of the place where it is waited for [m].
+    """
+    time = torch.zeros_like(height)
+    for _ in range(ROUNDS):
+        lever = quaternion_apply(fallen(body, velocity, spin, time)[1], carried)[:, 2]
+        time = fall_time(body[0][:, 2] + lever - height, velocity[:, 2])
+    return time
+
+
+def slid(goal: Pose, axis: Float[Tensor, "n 3"], height: Float[Tensor, " n"]) -> Pose:
+    """The pose moved along an axis of unit length until it is at a height; an axis near the horizontal is left."""
+    steep = axis[:, 2].abs().clamp(min=STEEP) * torch.where(axis[:, 2] < 0, -1.0, 1.0)
+    return goal[0] + axis * ((height - goal[0][:, 2]) / steep)[:, None], goal[1]
 
 
 @dataclass(frozen=True)
@@ -121,7 +126,7 @@ class Strike:
         down = torch.tensor([0.0, 0.0, -1.0]).to(self.top)
         return quaternion_from_matrix(torch.stack([down, torch.linalg.cross(self._along, down), self._along], -1))
 
-    def hammer(self, depth: Float[Tensor, " n"], raised: Float[Tensor, " n"], gap: float) -> Pose:
+    def hammer(self, depth: Float[Tensor, " n"], raised: Float[Tensor, " n"], gap: Float[Tensor, " n"] | float) -> Pose:
         """Pose of the hammer raised by an angle [rad] from where its face is `gap` [m] above the nail's head.
 
         `depth` [m] is how far the nail has sunk.

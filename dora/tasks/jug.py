@@ -14,15 +14,27 @@ from torch import Tensor
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.map import AffordanceMap
 from dora.affordance.objects import load_object
-from dora.affordance.shipped import load_candidates
+from dora.affordance.reach import Reach
+from dora.affordance.reach_table import Grid, ReachTable
+from dora.affordance.shipped import data_folder, load_candidates
 from dora.affordance.structure import AffordanceObject
 from dora.affordance.voting import vote
+from dora.robot import load_robot
 from dora.robot.rotations import quaternion_apply, quaternion_from_rotation_vector
 from dora.sim.objects import build_object
 from dora.tasks.base import DoraEnv
 from dora.tasks.observations import Entry
 from dora.tasks.rewards import Term, Terms, closeness
-from dora.tasks.snapshot import Snapshot, derived, goal_error, in_wrist, lifted, opposed, tips_in_object
+from dora.tasks.snapshot import (
+    Snapshot,
+    derived,
+    derived_from_contacts,
+    goal_error,
+    in_wrist,
+    lifted,
+    opposed,
+    tips_in_object,
+)
 from dora.tasks.stages import Stage
 
 EMPTY, FULL = 0.30, 0.60
@@ -53,6 +65,10 @@ ALPHA = 4.0
 """Spatial sensitivity of the affordance reward [1/m]."""
 CLASS = "HandleGrasp"
 """The grasp class that the task asks for."""
+MOST = 40
+"""Stored candidates that the task works with."""
+FEWEST_LIFTS = 0.5
+"""Share of executed lifts that a ranked candidate must have survived to be one of them."""
 
 
 @cache
@@ -69,9 +85,24 @@ def jug_map() -> AffordanceMap:
 
 @cache
 def stored_candidates() -> GraspCandidates:
-    """The shipped handle grasps that were validated and ranked."""
-    candidates = load_candidates("jug")
-    return candidates.select(candidates.of_class(CLASS))
+    """The best of the shipped handle grasps: validated and ranked, at most `MOST` of them."""
+    found = load_candidates("jug")
+    return found.select(found.of_class(CLASS) & ~(found.score < FEWEST_LIFTS)).select(slice(MOST))
+
+
+@cache
+def reach_table() -> ReachTable:
+    """f_reach of those candidates over the area and the yaws at which the jug may start."""
+    reach = Reach(load_robot(JugEnv.SUPPORTED_ROBOTS[0]), jug(), start=JugEnv.HOME)
+    return ReachTable.of(reach, stored_candidates(), Grid(CENTRE, (SPREAD, SPREAD)), jug().support, jug().rest)
+
+
+def ship_reach_table() -> None:
+    """Puts the table into the folder of data that come with Dora; for whoever has made new candidates."""
+    for old in data_folder().glob("reach-*.safetensors"):
+        old.unlink()
+    table = reach_table()
+    table.save(data_folder() / f"reach-{table.digest[:16]}.safetensors")
 
 
 def _scale(s: Snapshot) -> Float[Tensor, " n"]:
@@ -93,7 +124,7 @@ def handle_distance(s: Snapshot) -> Float[Tensor, "n 5"]:
     return region_distances(s)[..., jug().labels.index(jug().target)]
 
 
-@derived
+@derived_from_contacts
 def grasp_label(s: Snapshot) -> Int[Tensor, " n"]:
     """The region that the hand's actual contacts vote for, an index into the jug's labels; -1 without contact."""
     return vote(jug_map(), s.contact_p / _scale(s)[:, None, None], s.contact_finger)
@@ -140,7 +171,7 @@ STAGES: list[Stage[Snapshot]] = [
     Stage("reach", lambda s: closeness(_reach(s), NEAR, 0.25), lambda s: _reach(s) < NEAR),
     Stage(
         "grasp",
-        lambda s: (s.touch[:, 0].float() + s.touch[:, 1:5].any(-1) + by_the_handle(s)) / 3,
+        lambda s: (s.touch[:, 0].float() + s.touch[:, 1:5].any(-1) + by_the_handle(s).float()) / 3,
         lambda s: opposed(s) & by_the_handle(s),
         hold=3,
         lost=lambda s: _reach(s) > 3 * NEAR,
@@ -285,6 +316,7 @@ class JugEnv(DoraEnv):
     MAX_STEPS = 120
     DEEPEST = DEEPEST
     CONTACT_POINTS = 32
+    HOME = "above"
 
     def candidates(self) -> GraspCandidates:
         return stored_candidates()
@@ -297,6 +329,9 @@ class JugEnv(DoraEnv):
     def masses(self, nominal: Float[Tensor, " b"], u: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
         """Anything from empty to full, or half full with a preset that does not vary masses."""
         return EMPTY + (FULL - EMPTY) * u if self.preset.mass > 0 else nominal
+
+    def reachable(self, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]) -> Bool[Tensor, "b c"]:
+        return reach_table().mask(object_p, object_q)
 
     def place(self, env_idx: Tensor, u: Tensor) -> None:
         u = u.reshape(-1, TRIES, 3)

@@ -24,20 +24,24 @@ from dora.sim.substeps import watch_physics
 
 TRAVEL = 0.025
 """How far the nail can sink [m]."""
+DRIVEN = 0.010
+"""How far blows must drive it [m]."""
 STAND = 0.03
 """Height of the nail's head above the post before the first blow [m]."""
 HEAD_RADIUS = 0.010
 HEAD_HALF = 0.002
-"""Radius and half thickness of the nail's head [m]."""
+"""Radius and half thickness of the nail's head as it is drawn [m]."""
+STOP_HALF = 0.010
+"""Half thickness of the head for collisions [m]: a blow sinks several millimetres into a thin one and comes out below."""
 SHANK_RADIUS = 0.003
 """Radius of the nail, which is only drawn [m]."""
 POST_HALF = 0.04
 """Half width of the post [m]."""
 MASS = 0.05
 """Mass of the nail [kg]."""
-RESISTANCE = 20.0
+RESISTANCE = 30.0
 """Constant force against the hammer [N]; a fifth more than the fingers hold steadily."""
-DRAG = 40.0
+DRAG = 30.0
 """Force per speed against the hammer [N s/m]."""
 DRIVE_LIMIT = 1e4
 """Largest force of the viscous drive [N]: none."""
@@ -177,8 +181,10 @@ def _build(scene: ManiSkillScene, top: tuple[float, float, float]) -> Articulati
     nail.set_joint_name("nail")
     nail.set_joint_properties("prismatic", [[0.0, TRAVEL]], axis, axis, friction=0.0, damping=0.0)
     head = sapien.Pose([0, 0, -HEAD_HALF], DOWN)
-    density = MASS / (np.pi * HEAD_RADIUS**2 * 2 * HEAD_HALF)
-    nail.add_cylinder_collision(head, HEAD_RADIUS, HEAD_HALF, material, density=density)
+    density = MASS / (np.pi * HEAD_RADIUS**2 * 2 * STOP_HALF)
+    nail.add_cylinder_collision(
+        sapien.Pose([0, 0, -STOP_HALF], DOWN), HEAD_RADIUS, STOP_HALF, material, density=density
+    )
     if scene.can_render():
         pine, iron = (sapien.render.RenderMaterial(base_color=list(c), roughness=0.6) for c in (PINE, IRON))
         post.add_box_visual(centre, half, pine)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import wraps
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -24,8 +24,8 @@ CONTACT_CLASSES = ("none", "palm", *FINGERS)
 """Names of the values of `Snapshot.contact_finger`."""
 
 
-DERIVED = "_derived"
-"""Where a snapshot keeps what `derived` functions have computed."""
+DERIVED, FROM_CONTACTS = "_derived", "_from_contacts"
+"""Where a snapshot keeps what `derived` and `derived_from_contacts` functions have computed."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,9 @@ class Snapshot:
     contact_finger: Int[Tensor, "n m"]
 
 
-Derived = Callable[[Snapshot], Any]
+S = TypeVar("S", bound=Snapshot)
+"""A snapshot, perhaps one that a task has extended."""
+Derived = Callable[[Any], Any]
 
 
 def derived(function: Derived) -> Derived:
@@ -105,10 +107,18 @@ def derived(function: Derived) -> Derived:
 
     The quantity must not depend on `stage`, `phase` or `time`, which alone change when the machines advance.
     """
+    return _once(function, DERIVED)
 
+
+def derived_from_contacts(function: Derived) -> Derived:
+    """The same for a quantity of the contacts and the object's size alone, which the noise of sensors leaves as it is."""
+    return _once(function, FROM_CONTACTS)
+
+
+def _once(function: Derived, place: str) -> Derived:
     @wraps(function)
     def once(s: Snapshot) -> Any:
-        known = s.__dict__.setdefault(DERIVED, {})
+        known = s.__dict__.setdefault(place, {})
         if function not in known:
             known[function] = function(s)
         return known[function]
@@ -116,12 +126,21 @@ def derived(function: Derived) -> Derived:
     return once
 
 
-def advanced(s: Snapshot, **changes: Tensor) -> Snapshot:
+def advanced(s: S, **changes: Tensor) -> S:
     """The snapshot with another `stage`, `phase` or `time`; what was derived from it stays."""
     if not set(changes) <= {"stage", "phase", "time"}:
         raise ValueError(f"only stage, phase and time may change, not {sorted(changes)}")
-    new = replace(s, **changes)
-    new.__dict__[DERIVED] = s.__dict__.get(DERIVED, {})
+    return _sharing(s, replace(s, **changes), DERIVED, FROM_CONTACTS)
+
+
+def observed(s: S, **changes: Tensor) -> S:
+    """The snapshot with noise in poses and joints; what was derived from contacts alone stays."""
+    return _sharing(s, replace(s, **changes), FROM_CONTACTS)
+
+
+def _sharing(old: S, new: S, *places: str) -> S:
+    for place in places:
+        new.__dict__[place] = old.__dict__.setdefault(place, {})
     return new
 
 

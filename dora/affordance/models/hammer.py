@@ -12,7 +12,18 @@ import trimesh
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
-from dora.affordance.solids import capsule_between, chamfered_box, ellipses, hull_of, lathe, loft, spline, subtract, sweep, unite
+from dora.affordance.solids import (
+    capsule_between,
+    chamfered_box,
+    ellipses,
+    hull_of,
+    lathe,
+    loft,
+    spline,
+    subtract,
+    sweep,
+    unite,
+)
 from dora.affordance.structure import AffordanceObject, Piece, assemble, moved
 
 HEAD_MASS, HANDLE_MASS = 0.20, 0.08
@@ -21,13 +32,15 @@ HEAD_Z = 0.262
 SHOULDER_Z = 0.238
 """Height at which the handle begins to narrow into the head's eye; its capsules end there."""
 HANDLE_PROFILE = (
-    (0.0, 0.0060, 0.0030), (0.0012, 0.0105, 0.0065), (0.004, 0.0142, 0.0092), (0.010, 0.0163, 0.0108), (0.020, 0.0167, 0.0110),
-    (0.075, 0.0158, 0.0108), (0.120, 0.0160, 0.0110), (0.180, 0.0150, 0.0104), (SHOULDER_Z, 0.0142, 0.0100),
+    (0.0, 0.0060, 0.0030), (0.0012, 0.0105, 0.0065), (0.004, 0.0142, 0.0092), (0.010, 0.0163, 0.0108),
+    (0.020, 0.0167, 0.0110), (0.075, 0.0158, 0.0108), (0.120, 0.0160, 0.0110), (0.180, 0.0150, 0.0104),
+    (SHOULDER_Z, 0.0142, 0.0100),
     (0.246, 0.0110, 0.0085), (0.250, 0.0090, 0.0070), (0.2755, 0.0090, 0.0070),
 )  # fmt: skip
 """(height, half width along x, half width along y): round butt, grip, neck, and the tenon in the head's eye."""
 POLL_PROFILE = (
-    (-0.008, 0.0088), (0.012, 0.0085), (0.017, 0.0087), (0.023, 0.0100), (0.027, 0.0110), (0.0405, 0.0110), (0.042, 0.0095),
+    (-0.008, 0.0088), (0.012, 0.0085), (0.017, 0.0087), (0.023, 0.0100),
+    (0.027, 0.0110), (0.0405, 0.0110), (0.042, 0.0095),
 )  # fmt: skip
 """(x, radius) of the round front of the head, ending in a chamfered striking face."""
 FACE_X = POLL_PROFILE[-1][0]
@@ -55,7 +68,7 @@ def build() -> AffordanceObject:
     """The hammer; it rests on its side."""
     handle = _handle()
     poll, cheek, claw = _head_parts()
-    mesh, part = unite([handle, poll, cheek, claw])
+    mesh, part, _ = unite([handle, poll, cheek, claw])
     head = subtract(unite([poll, cheek, claw])[0], handle)
     x, _, z = mesh.triangles_center.T
     striking, gripped = (part == 1) & (x > FACE_X - 1e-4), (part == 0) & (z < HEAD_Z)
@@ -73,7 +86,10 @@ def build() -> AffordanceObject:
         weights=[(handle, HANDLE_MASS), (head, HEAD_MASS)],
         pieces=[
             *(Piece("handle", capsule) for capsule in capsules),
-            *(Piece("head", hull_of(part, HULL_VERTICES)) for part in (poll.vertices, cheek.vertices, *_claw_halves(claw))),
+            *(
+                Piece("head", hull_of(part, HULL_VERTICES))
+                for part in (poll.vertices, cheek.vertices, *_claw_halves(claw))
+            ),
         ],
         rest=ON_SIDE,
     )

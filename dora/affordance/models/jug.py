@@ -5,12 +5,26 @@ It stands on z = 0 about the z axis, handle towards +x, lip towards -x, until it
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import trimesh
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
-from dora.affordance.solids import arc, capsule_between, ellipses, fitted, lathe, loft, simplified, spline, subtract, sweep, unite
+from dora.affordance.solids import (
+    arc,
+    capsule_between,
+    ellipses,
+    fitted,
+    lathe,
+    loft,
+    simplified,
+    spline,
+    subtract,
+    sweep,
+    unite,
+)
 from dora.affordance.structure import AffordanceObject, Piece, assemble
 
 MASS = 0.30
@@ -54,11 +68,11 @@ def build() -> AffordanceObject:
     hollow = _pulled(lathe(_shell(), SECTIONS))
     filled = _pulled(lathe(_outside(), SECTIONS))
     core = lathe(_outside(WALL / 2), SECTIONS)
-    mesh, part = unite([hollow, subtract(handle, core)])
+    mesh, part, _ = unite([hollow, subtract(handle, core)])
     height = mesh.triangles_center[:, 2]
     labels = np.where(part == 1, HANDLE, np.where(height > RIM_BOTTOM, RIM, BODY))
     corners = fitted(path, simplified(path, CAPSULE_TOLERANCE))
-    capsules = [capsule_between(a, b, HANDLE_RADIUS) for a, b in zip(corners[:-1], corners[1:], strict=True)]
+    capsules = [capsule_between(a, b, HANDLE_RADIUS) for a, b in itertools.pairwise(corners)]
     return assemble(
         "jug",
         mesh,
@@ -77,8 +91,8 @@ def _outside(inset: float = 0.0) -> Float[np.ndarray, "n 2"]:
     side = np.linspace(height[0], height[-1], RINGS)
     side = np.stack([CubicSpline(height, radius)(side), side], -1)
     edge = side[0, 0] - FOOT_ROUNDING
-    foot = arc((edge, FOOT_ROUNDING), FOOT_ROUNDING, -90, 0, 5)[:-1]
-    lip = arc((side[-1, 0] - WALL / 2, side[-1, 1]), WALL / 2, 0, 90, 4)[1:]
+    foot = arc((edge, FOOT_ROUNDING), FOOT_ROUNDING, -90.0, 0.0, 5)[:-1]
+    lip = arc((side[-1, 0] - WALL / 2, side[-1, 1]), WALL / 2, 0.0, 90.0, 4)[1:]
     base = np.linspace(0, edge, 5)[:-1]
     outer = np.concatenate([np.stack([base, 0 * base], -1), foot, side, lip])
     outer[:, 0] = np.maximum(outer[:, 0] - inset, 0.0)
@@ -92,9 +106,9 @@ def _shell() -> Float[np.ndarray, "n 2"]:
     height, radius = np.array(RADII).T
     level = np.linspace(height[-1], FLOOR + FOOT_ROUNDING, RINGS)
     inside = np.stack([CubicSpline(height, radius)(level) - WALL, level], -1)
-    lip = arc((inside[0, 0] + WALL / 2, inside[0, 1]), WALL / 2, 90, 180, 4)[1:-1]
+    lip = arc((inside[0, 0] + WALL / 2, inside[0, 1]), WALL / 2, 90.0, 180.0, 4)[1:-1]
     edge = inside[-1, 0] - FOOT_ROUNDING
-    foot = arc((edge, FLOOR + FOOT_ROUNDING), FOOT_ROUNDING, 0, -90, 4)[1:]
+    foot = arc((edge, FLOOR + FOOT_ROUNDING), FOOT_ROUNDING, 0.0, -90.0, 4)[1:]
     floor = np.linspace(edge, 0, 5)[1:]
     return np.concatenate([outer, lip, inside, foot, np.stack([floor, np.full(4, FLOOR)], -1)])
 
@@ -106,7 +120,9 @@ def _pulled(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     pull = rise**2 * (3 - 2 * rise) * np.exp(-((np.arctan2(y, -x) / SPOUT_WIDTH) ** 2) / 2)
     grow = 1 + SPOUT_REACH * pull
     radius = np.hypot(x, y) / RADII[-1][1]
-    return trimesh.Trimesh(np.stack([x * grow, y * grow, z + SPOUT_RISE * pull * radius], -1), mesh.faces, process=False)
+    return trimesh.Trimesh(
+        np.stack([x * grow, y * grow, z + SPOUT_RISE * pull * radius], -1), mesh.faces, process=False
+    )
 
 
 def _handle_path() -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, " m"]]:
@@ -120,12 +136,14 @@ def _hulls() -> list[trimesh.Trimesh]:
     """Convex slices of the filled body."""
     profile = _outside()[:-4]
     hulls = []
-    for low, high in zip(HULL_CUTS[:-1], HULL_CUTS[1:], strict=True):
+    for low, high in itertools.pairwise(HULL_CUTS):
         inner = profile[(profile[:, 1] > low) & (profile[:, 1] < high)]
         ends = [[np.interp(z, profile[:, 1], profile[:, 0]), z] for z in (low, high)]
         rings = simplified(np.concatenate([ends[:1], inner, ends[1:]]), HULL_TOLERANCE)
         angle = np.linspace(0, 2 * np.pi, HULL_SECTIONS, endpoint=False)
         circle = np.stack([np.cos(angle), np.sin(angle)], -1)
-        points = np.concatenate([rings[:, None, :1] * circle, np.broadcast_to(rings[:, None, 1:], (len(rings), HULL_SECTIONS, 1))], -1)
+        points = np.concatenate(
+            [rings[:, None, :1] * circle, np.broadcast_to(rings[:, None, 1:], (len(rings), HULL_SECTIONS, 1))], -1
+        )
         hulls.append(trimesh.convex.convex_hull(_pulled(loft(points)).vertices))
     return hulls

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import trimesh
 
 from dora.affordance.solids import capsule_between, chamfered_box, ellipses, sweep, unite
 from dora.affordance.structure import AffordanceObject, Piece, assemble, moved
@@ -34,8 +35,8 @@ def build() -> AffordanceObject:
     bar = _rounded_bar()
     posts = [_post(z) for z in (-POST_Z, POST_Z)]
     door = moved(chamfered_box(DOOR, CHAMFER, subdivisions=3), np.array([-DOOR[0] / 2, 0, 0]))
-    mesh, part = unite([door, bar, *posts])
-    handle, _ = unite([bar, *posts])
+    mesh, part, _ = unite([door, bar, *posts])
+    handle = unite([bar, *posts])[0]
     ends = np.array([[BAR_X, 0, -BAR_HALF_LENGTH], [BAR_X, 0, BAR_HALF_LENGTH]])
     feet = [np.array([[-POST_DEPTH, 0, z], [BAR_X, 0, z]]) for z in (-POST_Z, POST_Z)]
     x, y, z = (size / 2 for size in DOOR)
@@ -55,18 +56,17 @@ def build() -> AffordanceObject:
     )
 
 
-def _rounded_bar():
+def _rounded_bar() -> trimesh.Trimesh:
     """The bar with round ends."""
     angle = np.linspace(0.06, np.pi / 2, DOME)
     cap_z, cap_r = BAR_RADIUS * np.cos(angle), BAR_RADIUS * np.sin(angle)
-    z = np.concatenate([
-        -BAR_HALF_LENGTH - cap_z[:-1], np.linspace(-BAR_HALF_LENGTH, BAR_HALF_LENGTH, STEPS), BAR_HALF_LENGTH + cap_z[-2::-1],
-    ])  # fmt: skip
+    straight = np.linspace(-BAR_HALF_LENGTH, BAR_HALF_LENGTH, STEPS)
+    z = np.concatenate([straight[0] - cap_z[:-1], straight, straight[-1] + cap_z[-2::-1]])
     radius = np.concatenate([cap_r[:-1], np.full(STEPS, BAR_RADIUS), cap_r[-2::-1]])
     return sweep(np.stack([0 * z + BAR_X, 0 * z, z], -1), ellipses(radius, radius, POINTS))
 
 
-def _post(z: float):
+def _post(z: float) -> trimesh.Trimesh:
     """One post, from inside the door to the bar's axis."""
     x = np.linspace(-POST_DEPTH, BAR_X, 10)
     radius = np.full(len(x), POST_RADIUS)

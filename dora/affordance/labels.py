@@ -1,0 +1,166 @@
+"""Names of the parts of a user's mesh: from a file with one label per face, from regions in space, or from the mesh."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from jaxtyping import Bool, Float, Int
+
+from dora.errors import InputError
+
+WHOLE = "body"
+"""Label of a mesh without parts, and of what no region covers."""
+WANTED = "handle"
+"""Label that is the target if a mesh has it and nothing else is asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class FaceLabels:
+    """Labels of F faces.
+
+    Attributes:
+        names: of the regions, each with at least one face.
+        index: (f,) index into `names`.
+        target: name of the region that a task wants held.
+    """
+
+    names: tuple[str, ...]
+    index: Int[np.ndarray, " f"]
+    target: str
+
+    @classmethod
+    def from_names(cls, names: Sequence[str], target: str | None = None, source: str = "the mesh") -> FaceLabels:
+        """From one name per face.
+
+        Raises:
+            InputError: the target is none of them.
+        """
+        distinct = tuple(dict.fromkeys(names))
+        if target is None:
+            target = WANTED if WANTED in distinct else distinct[0]
+        if target not in distinct:
+            raise InputError(f"{source} asks for the target {target!r}; choose one of: {', '.join(distinct)}.")
+        place = {name: i for i, name in enumerate(distinct)}
+        return cls(distinct, np.array([place[name] for name in names], np.int64), target)
+
+
+def grasp_class(label: str) -> str:
+    """Grasp class of a label: "handle" -> "HandleGrasp", "left ear" -> "LeftEarGrasp"."""
+    words = re.split(r"[^0-9A-Za-z]+", label)
+    return "".join(word[:1].upper() + word[1:] for word in words) + "Grasp"
+
+
+def read_labels(path: Path, centers: Float[np.ndarray, "f 3"]) -> FaceLabels:
+    """Labels of the faces of a mesh.
+
+    Args:
+        path: .txt with one name or number per line, .npy with one number or name per face, .json with a list of
+            them or {"labels": [names], "faces": [numbers], "target": name}, or .yaml with regions (docs/objects.md).
+        centers: (f, 3) centres of the faces in the coordinates of the mesh file.
+
+    Raises:
+        InputError: no such file, another kind of file, another number of labels, or a name that does not exist.
+    """
+    if not path.is_file():
+        raise InputError(f"there is no label file {path}; give a .txt, .npy, .json or .yaml file.")
+    readers: dict[str, Callable[[Path, np.ndarray], FaceLabels]] = {
+        ".txt": _from_text, ".npy": _from_array, ".json": _from_json, ".yaml": _from_yaml, ".yml": _from_yaml,
+    }  # fmt: skip
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"labels cannot be read from {path}: give a file ending in {', '.join(readers)}.")
+    try:
+        return reader(path, centers)
+    except (json.JSONDecodeError, yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{path} is no valid {path.suffix} file ({reason}); correct it.") from error
+
+
+def _from_text(path: Path, centers: np.ndarray) -> FaceLabels:
+    return _per_face(path, path.read_text().split("\n"), centers)
+
+
+def _from_array(path: Path, centers: np.ndarray) -> FaceLabels:
+    return _per_face(path, np.load(path, allow_pickle=False).ravel().tolist(), centers)
+
+
+def _from_json(path: Path, centers: np.ndarray) -> FaceLabels:
+    content = json.loads(path.read_text())
+    if isinstance(content, list):
+        return _per_face(path, content, centers)
+    known = {"labels", "faces", "target"}
+    if not isinstance(content, dict) or not {"labels", "faces"} <= content.keys() <= known:
+        raise InputError(f'{path} must be a list, or hold "labels", "faces" and if wanted "target", nothing else.')
+    names = [str(name) for name in content["labels"]]
+    return _per_face(path, content["faces"], centers, names, content.get("target"))
+
+
+def _per_face(
+    path: Path, entries: Sequence[Any], centers: np.ndarray, names: Sequence[str] = (), target: str | None = None
+) -> FaceLabels:
+    """From one entry per face: a name, or a number that counts `names` or, without them, names itself."""
+    texts = [str(entry).strip() for entry in entries]
+    while texts and not texts[-1]:
+        texts.pop()
+    if len(texts) != len(centers):
+        raise InputError(
+            f"{path} has {len(texts)} labels for the {len(centers)} triangles of the mesh: give one for each, "
+            "in the order of the mesh file."
+        )
+    known = {str(i): name for i, name in enumerate(names)} | {name: name for name in names}
+    for face, text in enumerate(texts):
+        if not text or text.startswith("-") or (names and text not in known):
+            choice = ", ".join(names) or "a name or a number from 0"
+            raise InputError(f"{path} labels face {face} {text!r}, which is no label; use {choice}.")
+    return FaceLabels.from_names([known.get(t, f"region{t}" if t.isdigit() else t) for t in texts], target, str(path))
+
+
+def _from_yaml(path: Path, centers: np.ndarray) -> FaceLabels:
+    """From regions in space; a face belongs to the first that holds its centre."""
+    content = yaml.safe_load(path.read_text())
+    known = {"regions", "rest", "target"}
+    if not isinstance(content, dict) or not isinstance(content.get("regions"), dict) or not content.keys() <= known:
+        raise InputError(f"{path} must hold a mapping 'regions' and, if wanted, 'rest' and 'target', nothing else.")
+    names = np.full(len(centers), str(content.get("rest", WHOLE)), dtype=object)
+    free = np.ones(len(centers), bool)
+    for name, shape in content["regions"].items():
+        held = _inside(path, str(name), shape, centers)
+        if not held.any():
+            raise InputError(
+                f"region {name!r} of {path} holds no face; the mesh reaches from {centers.min(0).round(4).tolist()} "
+                f"to {centers.max(0).round(4).tolist()} in the coordinates of its file."
+            )
+        names[held & free] = str(name)
+        free &= ~held
+    return FaceLabels.from_names(names.tolist(), content.get("target"), str(path))
+
+
+SHAPES = {"box": ("min", "max"), "plane": ("point", "normal")}
+"""Kinds of regions and their two vectors: a box between corners, or the side of a plane to which its normal points."""
+
+
+def _inside(path: Path, name: str, shape: Any, centers: Float[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+    """Which centres lie in a region, or in one of a list of regions."""
+    if isinstance(shape, list) and shape:
+        return np.any([_inside(path, name, each, centers) for each in shape], axis=0)
+    for kind, keys in SHAPES.items():
+        if isinstance(shape, dict) and list(shape) == [kind] and isinstance(shape[kind], dict):
+            vectors = [np.array(shape[kind].get(key, ()), np.float64) for key in keys]
+            if len(shape[kind]) == 2 and all(v.shape == (3,) and np.isfinite(v).all() for v in vectors):
+                first, second = vectors
+                if kind == "box":
+                    return ((centers >= first) & (centers <= second)).all(1)
+                return (centers - first) @ second > 0
+    raise InputError(
+        f"region {name!r} of {path} must be box: {{min: [x, y, z], max: [x, y, z]}} or "
+        "plane: {point: [x, y, z], normal: [x, y, z]}, or a list of these."
+    )

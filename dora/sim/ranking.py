@@ -1,0 +1,207 @@
+"""Ranking of grasp candidates by executing them: reach, close, lift from a table, hold.
+
+The palm rides on a carriage instead of the arm: it comes along the candidate's approach direction, closes as fast as
+the tasks' reference does, and rises. Every candidate is executed several times, with other masses, frictions and
+errors of its pose each time. Draws for ranking and for reporting are separate streams, so that the best of many are
+not reported with the luck they were chosen for.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import sapien
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.protocol import STANDARD
+from dora.affordance.structure import AffordanceObject
+from dora.errors import InputError
+from dora.robot import RobotDescription
+from dora.robot.rotations import (
+    matrix_from_quaternion,
+    quaternion_apply,
+    quaternion_from_rotation_vector,
+    quaternion_multiply,
+)
+from dora.sim.rig import Physics, Rig
+from dora.sim.validation import check_object
+from dora.sim.workers import Progress, run_cases
+
+Purpose = Literal["ranking", "reporting"]
+_STREAM: dict[Purpose, int] = {"ranking": 0, "reporting": 1}
+COMMANDS = 20.0
+"""Commands to the hand per second, as in the tasks [1/s]."""
+BLOCKED = 0.03
+"""Lag of the palm behind its command at which an approach has hit something [m]."""
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How candidates are executed, and what is drawn for each execution.
+
+    Attributes:
+        draws: executions per candidate.
+        mass: range of the factor on the object's mass, uniform.
+        friction: range of the coefficient between object, hand and table, uniform.
+        position: largest error of the wrist's position along each axis of the object [m], uniform.
+        rotation: largest error of the wrist's orientation about each axis of the hand [rad], uniform.
+        standoff: where the approach begins, before the grasp [m].
+        speed: of the approach and of the lift [m/s].
+        closing_time: from the opened to the squeezing hand [s].
+        settling_time: before the lift [s].
+        height: rise of the palm [m].
+        lifted: rise of the object that counts [m].
+        hold: time at the top [s].
+        turn: largest change of the object's orientation from the table to the end of the hold [rad].
+    """
+
+    draws: int = 8
+    mass: tuple[float, float] = (0.75, 1.5)
+    friction: tuple[float, float] = (0.6, 1.0)
+    position: float = 0.005
+    rotation: float = 0.05
+    standoff: float = 0.10
+    speed: float = 0.16
+    closing_time: float = 0.6
+    settling_time: float = 0.2
+    height: float = 0.14
+    lifted: float = 0.10
+    hold: float = 0.5
+    turn: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.draws < 1:
+            raise InputError(f"ranking needs at least 1 execution per candidate, not {self.draws}.")
+        for name in ("mass", "friction"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high:
+                raise InputError(
+                    f"the range of {name} for ranking must be positive and ascending, not {low} to {high}."
+                )
+
+
+@dataclass(frozen=True)
+class Lift:
+    """One execution: the wrist's pose in the world, unit approach (3,), joints (20,) [rad], mass [kg], friction."""
+
+    position: np.ndarray
+    quaternion: np.ndarray
+    approach: np.ndarray
+    pregrasp: np.ndarray
+    grasp: np.ndarray
+    mass: float
+    friction: float
+
+
+class LiftTest:
+    """Executes one lift after the other; tells whether the object was up and steady in the end."""
+
+    def __init__(self, obj: AffordanceObject, robot: RobotDescription, execution: Execution, physics: Physics):
+        self.execution, self.physics = execution, physics
+        self.rest = np.array([0.0, 0.0, obj.support]), np.array(obj.rest)
+        gravity = (0.0, 0.0, -STANDARD.gravity)
+        self.rig = Rig(obj, robot, STANDARD.friction, physics, gravity, carriage=True, table=True)
+
+    def __call__(self, lift: Lift) -> bool:
+        """Reach, close, lift and hold."""
+        e, rig = self.execution, self.rig
+        turn = matrix_from_quaternion(torch.tensor(lift.quaternion)).numpy()
+        before, above = -e.standoff * lift.approach @ turn, np.array([0.0, 0.0, e.height]) @ turn
+        grasp = np.zeros(3)
+        rig.stage(*self.rest, lift.mass, lift.friction)
+        rig.hand.reset(lift.pregrasp, sapien.Pose(lift.position, lift.quaternion), before)
+        if not self._move(before, grasp):
+            return False
+        self._close(lift)
+        rig.run(self.physics.steps(e.settling_time))
+        self._move(grasp, above)
+        rig.run(self.physics.steps(e.hold))
+        return self._succeeded()
+
+    def _move(self, begin: np.ndarray, end: np.ndarray) -> bool:
+        """Palm along a straight line, offsets (3,) from the grasp in its frame [m]; whether it got there."""
+        commands = max(1, round(float(np.linalg.norm(end - begin)) / self.execution.speed * COMMANDS))
+        for command in range(1, commands + 1):
+            self.rig.hand.move((begin + (end - begin) * command / commands).tolist())
+            self.rig.run(self.physics.steps(1 / COMMANDS))
+        return self.rig.hand.lag < BLOCKED
+
+    def _close(self, lift: Lift) -> None:
+        commands = max(1, round(self.execution.closing_time * COMMANDS))
+        for command in range(1, commands + 1):
+            self.rig.hand.command(lift.pregrasp + (lift.grasp - lift.pregrasp) * command / commands)
+            self.rig.run(self.physics.steps(1 / COMMANDS))
+
+    def _succeeded(self) -> bool:
+        pose, grip = self.rig.pose, self.rig.read_grip()
+        cosine = min(1.0, abs(float(np.dot(pose.q, self.rest[1]))))
+        up = float(pose.p[2] - self.rest[0][2]) > self.execution.lifted
+        return up and grip.held and 2 * np.arccos(cosine) < self.execution.turn
+
+
+def rank(
+    candidates: GraspCandidates,
+    obj: AffordanceObject,
+    robot: RobotDescription,
+    execution: Execution | None = None,
+    purpose: Purpose = "ranking",
+    seed: int = 0,
+    physics: Physics | None = None,
+    processes: int | None = None,
+    progress: Progress | None = None,
+) -> Float[Tensor, " c"]:
+    """Share of executed lifts that succeeded, per candidate.
+
+    A lift succeeds if at the end the object is `lifted` above its start, in contact with the hand, and has turned by
+    less than `turn`. The arm is left out: whether it reaches a candidate is for the motion-feasibility filter to say.
+
+    Args:
+        candidates: of this object and this robot.
+        obj: the object; it starts at rest on a table, as it is described.
+        robot: its hand is simulated on a carriage.
+        execution: how, and what is drawn.
+        purpose: which stream of draws: choose with "ranking", report with "reporting".
+        seed: of the draws; all candidates get the same draws.
+        physics: how finely.
+        processes: number of processes, one per core by default; 1 stays in this process.
+        progress: called with the number of executions done and of all.
+
+    Raises:
+        InputError: the candidates are of another object.
+        RuntimeError: a simulating process died.
+    """
+    check_object(candidates, obj)
+    execution = execution or Execution()
+    lifts = _lifts(candidates, obj, execution, np.random.default_rng([seed, _STREAM[purpose]]))
+    done = run_cases(LiftTest, (obj, robot, execution, physics or Physics()), lifts, processes, progress)
+    return torch.tensor(done, dtype=torch.float32).view(len(candidates), execution.draws).mean(1)
+
+
+def _lifts(
+    candidates: GraspCandidates, obj: AffordanceObject, execution: Execution, random: np.random.Generator
+) -> list[Lift]:
+    """All executions, candidate by candidate."""
+    draws, count = execution.draws, len(candidates)
+    factor = random.uniform(*execution.mass, draws)
+    friction = random.uniform(*execution.friction, draws)
+    shift = torch.tensor(random.uniform(-execution.position, execution.position, (draws, 3)), dtype=torch.float32)
+    tilt = torch.tensor(random.uniform(-execution.rotation, execution.rotation, (draws, 3)), dtype=torch.float32)
+    rest = torch.tensor(obj.rest, dtype=torch.float32).expand(count * draws, 4)
+    height = torch.tensor([0.0, 0.0, obj.support])
+
+    def every(field: Tensor) -> Tensor:
+        return field.cpu().float().repeat_interleave(draws, 0)
+
+    position = height + quaternion_apply(rest, every(candidates.position) + shift.repeat(count, 1))
+    turned = quaternion_multiply(rest, every(candidates.quaternion))
+    turned = quaternion_multiply(turned, quaternion_from_rotation_vector(tilt).repeat(count, 1))
+    approach = quaternion_apply(rest, every(candidates.approach))
+    rows = position, turned, approach, every(candidates.pregrasp), every(candidates.grasp)
+    arrays = [row.numpy().astype(np.float64) for row in rows]
+    return [
+        Lift(*(array[i] for array in arrays), mass=obj.mass * factor[i % draws], friction=friction[i % draws])
+        for i in range(count * draws)
+    ]

@@ -1,0 +1,158 @@
+"""A test rig: one object and a hand without an arm, alone in a scene."""
+
+from collections.abc import Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import sapien
+from sapien import physx
+
+from dora.affordance.structure import AffordanceObject
+from dora.errors import InputError
+from dora.robot import RobotDescription
+from dora.sim.grip import GripReader
+from dora.sim.hand import FloatingHand
+from dora.sim.objects import CONTACT_OFFSET, object_entity
+
+TABLE_HALF = (1.0, 1.0, 0.05)
+"""Half extents of the table [m]; its upper face is z = 0."""
+ANGULAR_DAMPING = 0.05
+"""PhysX's default damping of rotation [1/s]."""
+_ZERO = np.zeros(3, np.float32)
+
+
+@dataclass(frozen=True)
+class Physics:
+    """How finely a rig is simulated.
+
+    Attributes:
+        rate: physics steps per second [1/s].
+        position_iterations: of the solver (TGS), per step.
+        velocity_iterations: of the solver, per step.
+        contact_offset: distance at which contacts with the object begin to be looked for [m].
+    """
+
+    rate: float = 200.0
+    position_iterations: int = 8
+    velocity_iterations: int = 1
+    contact_offset: float = CONTACT_OFFSET
+
+    def __post_init__(self) -> None:
+        if not (self.rate > 0 and self.position_iterations > 0 and self.velocity_iterations >= 0):
+            raise InputError("the physics rate and iterations must be positive; correct them.")
+
+    def steps(self, duration: float) -> int:
+        """Physics steps in a time [s]; at least 1."""
+        return max(1, round(duration * self.rate))
+
+
+@contextmanager
+def _gravity(gravity: Sequence[float]):
+    """SAPIEN gives a new physics system the global scene settings: change them for a moment."""
+    before = physx.get_scene_config()
+    kept = (before.gravity.copy(), before.enable_tgs)
+    physx.set_scene_config(gravity=np.array(gravity, np.float32), enable_tgs=True)
+    try:
+        yield
+    finally:
+        physx.set_scene_config(gravity=kept[0], enable_tgs=kept[1])
+
+
+class Rig:
+    """A scene with a floating hand and a free object, reused for many grasps.
+
+    Args:
+        obj: the object.
+        robot: whose hand it is.
+        friction: coefficient of hand and object.
+        physics: how finely.
+        gravity: acceleration (3,) [m/s^2]; the hand is weightless in any case.
+        carriage: whether the palm can be moved (`FloatingHand`).
+        table: whether there is a table under z = 0.
+
+    Attributes:
+        hand: the hand.
+        body: the object's body.
+        step: makes one physics step.
+    """
+
+    def __init__(
+        self,
+        obj: AffordanceObject,
+        robot: RobotDescription,
+        friction: float,
+        physics: Physics,
+        gravity: Sequence[float] = (0.0, 0.0, 0.0),
+        carriage: bool = False,
+        table: bool = False,
+    ):
+        self.physics = physics
+        with _gravity(gravity):
+            system = physx.PhysxCpuSystem()
+        system.timestep = 1 / physics.rate
+        self._scene = sapien.Scene([system])
+        self.step = system.step
+        iterations = physics.position_iterations, physics.velocity_iterations
+        self.hand = FloatingHand(self._scene, robot, friction, iterations, carriage)
+        self._entity = object_entity(obj, friction=friction, contact_offset=physics.contact_offset)
+        self.body = self._entity.find_component_by_type(physx.PhysxRigidDynamicComponent)
+        self.body.set_solver_position_iterations(iterations[0])
+        self.body.set_solver_velocity_iterations(iterations[1])
+        self._scene.add_entity(self._entity)
+        self._mass, self._inertia = self.body.mass, np.array(self.body.inertia)
+        bodies = [self.body, *self.hand.articulation.links]
+        self._materials = [shape.physical_material for body in bodies for shape in body.collision_shapes]
+        if table:
+            self._add_table(friction)
+        self.read_grip = GripReader(system.get_contacts, self.body, self.hand.part_of, system.timestep).read
+
+    def _add_table(self, friction: float) -> None:
+        half = np.array(TABLE_HALF, np.float32)
+        shape = physx.PhysxCollisionShapeBox(half, physx.PhysxMaterial(friction, friction, 0.0))
+        shape.local_pose = sapien.Pose([0.0, 0.0, -TABLE_HALF[2]])
+        self._materials.append(shape.physical_material)
+        top = physx.PhysxRigidStaticComponent()
+        top.attach(shape)
+        entity = sapien.Entity()
+        entity.add_component(top)
+        self._scene.add_entity(entity)
+
+    def place(self, position: np.ndarray, quaternion: np.ndarray) -> None:
+        """Puts the object at rest, origin (3,) [m] and orientation wxyz (4,) in the world."""
+        self._entity.set_pose(sapien.Pose(position, quaternion))
+        self.body.set_linear_velocity(_ZERO)
+        self.body.set_angular_velocity(_ZERO)
+
+    def stage(self, position: np.ndarray, quaternion: np.ndarray, mass: float, friction: float) -> None:
+        """Puts the object at rest and gives it a mass [kg] and, with the hand, a coefficient of friction."""
+        self.place(position, quaternion)
+        self.body.set_mass(mass)
+        self.body.set_inertia(self._inertia * (mass / self._mass))
+        for material in self._materials:
+            material.static_friction = friction
+            material.dynamic_friction = friction
+
+    def run(self, steps: int) -> None:
+        """Makes physics steps."""
+        for _ in range(steps):
+            self.step()
+
+    def damp(self, rate: float) -> None:
+        """Lets the object's velocities decay at a rate [1/s]; 0 is free motion."""
+        self.body.set_linear_damping(rate)
+        self.body.set_angular_damping(max(rate, ANGULAR_DAMPING))
+
+    def push(self, force: np.ndarray) -> None:
+        """A force (3,) [N] on the centre of mass during the next physics step."""
+        self.body.add_force_torque(force, _ZERO)
+
+    @property
+    def position(self) -> np.ndarray:
+        """The object's centre of mass (3,) in the world [m]."""
+        return self._entity.pose.p
+
+    @property
+    def pose(self) -> sapien.Pose:
+        """The object's pose in the world."""
+        return self._entity.pose

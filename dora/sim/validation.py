@@ -1,0 +1,264 @@
+"""Validation of grasp candidates by simulation: the hand closes, then gravity pulls in six directions in turn.
+
+docs/validation.md says what is done and why; the numbers are in `dora.affordance.protocol`. Candidates are shared
+out over processes. Each process simulates one after the other in a scene of its own, since a PhysX step of several
+hands takes as long as the steps of each; a candidate that fails makes room for the next at once.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.map import AffordanceMap
+from dora.affordance.protocol import DIRECTIONS, STANDARD, Protocol
+from dora.affordance.structure import AffordanceObject
+from dora.errors import InputError
+from dora.robot import RobotDescription
+from dora.robot.rotations import matrix_from_quaternion, quaternion_apply, quaternion_inverse
+from dora.sim.grip import Grip
+from dora.sim.rig import Physics, Rig
+from dora.sim.workers import Progress, run_cases
+
+LOOK = 0.05
+"""Time between measurements of the displacement [s]."""
+TOUCH = 0.25
+"""Time between readings of the contacts [s]; reading takes as long as a physics step."""
+THROWN = 0.05
+"""Shift by closing at which a test ends: there is nothing left to hold [m]."""
+
+
+class Reason(IntEnum):
+    """How a test ended."""
+
+    PASSED = 0
+    THROWN = 1
+    """Closing moved the object by 5 cm."""
+    SLIPPED = 2
+    """The object moved too far under gravity."""
+    RELEASED = 3
+    """Nothing of the hand carried the object at the end of a direction."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One candidate, hand at the world's origin: pose of the object in the hand's frame, commanded joints.
+
+    Attributes:
+        position: (3,) [m].
+        quaternion: (4,) wxyz.
+        pregrasp: (20,) joints before closing [rad].
+        grasp: (20,) commanded joints of the squeezing hand [rad].
+    """
+
+    position: np.ndarray
+    quaternion: np.ndarray
+    pregrasp: np.ndarray
+    grasp: np.ndarray
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What became of one candidate; as `Validation`, and the grip after closing in the object frame."""
+
+    reason: Reason
+    displacement: float
+    closing_shift: float
+    penetration: float
+    grip: Grip | None
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """Results of c candidates.
+
+    Attributes:
+        reason: (c,) a `Reason` each.
+        displacement: (c,) farthest the centre of mass was from where closing left it [m].
+        closing_shift: (c,) how far closing moved the centre of mass [m].
+        penetration: (c,) deepest overlap of hand and object in the simulation, at readings from the end of closing
+            on [m].
+        part_force: (c, parts) contact force after closing on the palm and on each finger: magnitudes of the impulses
+            at the contact points over the time of the step, added up [N].
+        label_force: (c, labels) the same by the region of the object in which the contact points lie [N].
+        candidate_penetration: (c,) overlap of hand and object at the candidate, from the candidates [m].
+        self_penetration: (c,) overlap of the hand with itself at the candidate, from the candidates [m].
+        protocol: what was done.
+    """
+
+    reason: Int[Tensor, " c"]
+    displacement: Float[Tensor, " c"]
+    closing_shift: Float[Tensor, " c"]
+    penetration: Float[Tensor, " c"]
+    part_force: Float[Tensor, "c parts"]
+    label_force: Float[Tensor, "c labels"]
+    candidate_penetration: Float[Tensor, " c"]
+    self_penetration: Float[Tensor, " c"]
+    protocol: Protocol
+
+    @property
+    def passed(self) -> Bool[Tensor, " c"]:
+        """Whether the simulated hand held the object."""
+        return self.reason == Reason.PASSED
+
+    @property
+    def valid(self) -> Bool[Tensor, " c"]:
+        """Passed, with no more overlap at the candidate than the protocol allows."""
+        return self.passed & (self.candidate_penetration <= self.protocol.penetration)
+
+    @property
+    def strict(self) -> Bool[Tensor, " c"]:
+        """Valid, with no more self-penetration and no more shift by closing than the protocol's strict limits."""
+        tidy = self.self_penetration < self.protocol.strict_self_penetration
+        return self.valid & tidy & (self.closing_shift < self.protocol.strict_shift)
+
+    @property
+    def touched(self) -> Bool[Tensor, "c parts"]:
+        """Which of palm and fingers carried force after closing."""
+        return self.part_force > 0
+
+    @property
+    def held(self) -> Int[Tensor, " c"]:
+        """Index of the region that carried most force after closing; -1 if none did."""
+        return torch.where(self.label_force.sum(1) > 0, self.label_force.argmax(1), -1)
+
+
+class GripTest:
+    """Simulates one candidate after the other; arguments as of `validate`."""
+
+    def __init__(self, obj: AffordanceObject, robot: RobotDescription, protocol: Protocol, physics: Physics):
+        self.protocol, self.physics = protocol, physics
+        self.weight = obj.mass * protocol.gravity
+        self.rig = Rig(obj, robot, protocol.friction, physics)
+
+    def __call__(self, case: Case) -> Trial:
+        """Closes the hand and, if the object is still there, tries all directions."""
+        self.rig.place(case.position, case.quaternion)
+        self.rig.hand.reset(case.pregrasp)
+        shift = self._close(case)
+        if not shift < THROWN:
+            return Trial(Reason.THROWN, 0.0, shift, 0.0, None)
+        grip = self.rig.read_grip()
+        reason, displacement, depth = self._shake(case)
+        return Trial(reason, displacement, shift, max(grip.depth, depth), grip.seen_from(self.start))
+
+    def _close(self, case: Case) -> float:
+        """The hand moves from its opened to its squeezing posture; returns the object's shift [m]."""
+        rig, protocol = self.rig, self.protocol
+        steps, look = self.physics.steps(protocol.closing_time), self.physics.steps(LOOK)
+        shift, change = 0.0, case.grasp - case.pregrasp
+        rig.damp(protocol.closing_damping)
+        for step in range(1, steps + 1):
+            share = step / (protocol.ramp * steps)
+            if share < 1 + 1 / steps / protocol.ramp:
+                rig.hand.command(case.pregrasp + min(share, 1.0) * change)
+            rig.step()
+            if step % look == 0 or step == steps:
+                shift = float(np.linalg.norm(rig.position - case.position))
+                if not shift < THROWN:
+                    break
+        rig.damp(0.0)
+        self.start = rig.pose
+        return shift
+
+    def _shake(self, case: Case) -> tuple[Reason, float, float]:
+        """Gravity along all directions: how it ended, displacement and penetration [m]."""
+        rig, physics = self.rig, self.physics
+        turn = matrix_from_quaternion(torch.tensor(case.quaternion)).numpy()
+        origin, farthest, depth = self.start.p, 0.0, 0.0
+        push, step = rig.push, rig.step
+        looks = max(1, round(self.protocol.duration / LOOK))
+        for direction in DIRECTIONS:
+            force = (turn @ np.array(direction) * self.weight).astype(np.float32)
+            for look in range(1, looks + 1):
+                for _ in range(physics.steps(self.protocol.duration / looks)):
+                    push(force)
+                    step()
+                farthest = max(farthest, float(np.linalg.norm(rig.position - origin)))
+                if not farthest <= self.protocol.displacement:
+                    return Reason.SLIPPED, farthest, depth
+                if look % round(TOUCH / LOOK) == 0 or look == looks:
+                    grip = rig.read_grip()
+                    depth = max(depth, grip.depth)
+            if not grip.held:
+                return Reason.RELEASED, farthest, depth
+        return Reason.PASSED, farthest, depth
+
+
+def validate(
+    candidates: GraspCandidates,
+    obj: AffordanceObject,
+    robot: RobotDescription,
+    protocol: Protocol = STANDARD,
+    physics: Physics | None = None,
+    processes: int | None = None,
+    progress: Progress | None = None,
+) -> Validation:
+    """Tests every candidate in SAPIEN.
+
+    Equal candidates give equal results but for rare borderline cases: PhysX remembers contacts of the grasp before,
+    which changes the last bits.
+
+    Args:
+        candidates: of this object and this robot.
+        obj: the object.
+        robot: its hand is simulated with the palm held still, without the arm.
+        protocol: what is done.
+        physics: how finely.
+        processes: number of processes, one per core by default; 1 stays in this process.
+        progress: called with the number of candidates done and of all.
+
+    Raises:
+        InputError: the candidates are of another object.
+        RuntimeError: a simulating process died.
+    """
+    check_object(candidates, obj)
+    trials = run_cases(GripTest, (obj, robot, protocol, physics or Physics()), _cases(candidates), processes, progress)
+    parts = 1 + len(robot.fingers)
+    grips = [trial.grip for trial in trials]
+    numbers = torch.tensor([(t.displacement, t.closing_shift, t.penetration) for t in trials])
+    return Validation(
+        reason=torch.tensor([int(trial.reason) for trial in trials]),
+        displacement=numbers[:, 0],
+        closing_shift=numbers[:, 1],
+        penetration=numbers[:, 2],
+        part_force=torch.tensor(np.array([_part_force(grip, parts) for grip in grips]), dtype=torch.float32),
+        label_force=_label_force(grips, obj),
+        candidate_penetration=candidates.penetration.cpu(),
+        self_penetration=candidates.self_penetration.cpu(),
+        protocol=protocol,
+    )
+
+
+def check_object(candidates: GraspCandidates, obj: AffordanceObject) -> None:
+    """Raises InputError if the candidates are known to be of another object."""
+    if candidates.object != obj.name or candidates.digest not in ("", obj.digest):
+        raise InputError(f"the candidates are of another {candidates.object!r} than {obj.name!r}; generate new ones.")
+
+
+def _cases(candidates: GraspCandidates) -> list[Case]:
+    """The object as the hand sees it: the inverse of the wrist's pose in the object frame."""
+    turn = quaternion_inverse(candidates.quaternion)
+    fields = quaternion_apply(turn, -candidates.position), turn, candidates.pregrasp, candidates.grasp
+    return [Case(*row) for row in zip(*(field.cpu().numpy() for field in fields), strict=True)]
+
+
+def _part_force(grip: Grip | None, parts: int) -> np.ndarray:
+    return np.zeros(parts) if grip is None else grip.by_part(parts)
+
+
+def _label_force(grips: list[Grip | None], obj: AffordanceObject) -> Float[Tensor, "c labels"]:
+    """Force by the region of the surface point nearest to each contact point, all candidates at once."""
+    found = torch.zeros(len(grips), len(obj.labels))
+    known = [(row, grip) for row, grip in enumerate(grips) if grip is not None and len(grip.part)]
+    if known:
+        points = torch.tensor(np.concatenate([grip.point for _, grip in known]), dtype=torch.float32)
+        force = torch.tensor(np.concatenate([grip.force for _, grip in known]), dtype=torch.float32)
+        row = torch.tensor(np.repeat([row for row, _ in known], [len(grip.part) for _, grip in known]))
+        _, label = AffordanceMap.from_object(obj).nearest(points, 1)
+        found.index_put_((row, label[:, 0]), force, accumulate=True)
+    return found

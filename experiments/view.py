@@ -1,0 +1,93 @@
+"""Show an object, its regions and its grasps on a web page.
+
+    python experiments/view.py jug                                  # one of our objects with its shipped grasps
+    python experiments/view.py runs/grasps/jug.safetensors          # what experiments/grasps.py wrote
+    python experiments/view.py mug.glb --labels mug.yaml            # the regions of your own mesh
+    python experiments/view.py runs/grasps/mug.safetensors --mesh mug.glb --labels mug.yaml
+
+Runs until Ctrl-C.
+"""
+
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.importing import import_object
+from dora.affordance.objects import available_objects, load_object
+from dora.affordance.shipped import load_candidates
+from dora.affordance.structure import AffordanceObject
+from dora.affordance.viewing import GraspPage
+from dora.errors import InputError
+from dora.robot import load_robot
+
+BAD_INPUT = 2  # exit status after input that a person can mend
+GRASPS = ".safetensors"  # suffix of a file of grasps
+
+
+@dataclass
+class Args:
+    """Show an object, its regions and its grasps on a web page."""
+
+    source: tyro.conf.Positional[str]
+    """An object (cube, jug, hammer, microwave), a file of grasps (.safetensors) or a mesh file."""
+    port: int = 8080
+    """TCP port of the page."""
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 lets other machines see the page."""
+    mesh: Path | None = None
+    """Mesh of a file of grasps that is not of one of our objects."""
+    labels: Path | None = None
+    """Regions of the mesh, as for experiments/grasps.py."""
+    scale: float = 1.0
+    """Factor of all lengths of --mesh."""
+    units: Literal["m", "cm", "mm", "in"] = "m"
+    """Unit of length of --mesh; GLB files are in metres."""
+    robot: str = "diana7_hit"
+    """Robot whose hand is shown: a folder name in robots/ or a path."""
+
+
+def content(args: Args) -> tuple[AffordanceObject, GraspCandidates | None]:
+    """The object to show and its grasps, if there are any."""
+    robot = load_robot(args.robot)
+    if args.source in available_objects():
+        return load_object(args.source), load_candidates(args.source, robot)
+    path = Path(args.source)
+    if not path.is_file():
+        known = ", ".join(available_objects())
+        raise InputError(f"{args.source} is neither an object ({known}) nor a file: give one of them.")
+    if path.suffix != GRASPS:
+        return import_object(path, labels=args.labels, scale=args.scale, units=args.units), None
+    name = GraspCandidates.load(path).object
+    if args.mesh is not None:
+        obj = import_object(args.mesh, labels=args.labels, scale=args.scale, units=args.units)
+    elif name in available_objects():
+        obj = load_object(name)
+    else:
+        raise InputError(f"{path} holds grasps of {name!r}: give its mesh with --mesh, and --labels if it has any.")
+    return obj, GraspCandidates.load(path, obj, robot)
+
+
+def main() -> int:
+    """Serve the page until Ctrl-C; returns the exit status."""
+    args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
+    try:
+        obj, candidates = content(args)
+        page = GraspPage(obj, candidates, load_robot(args.robot), args.port, args.host)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return BAD_INPUT
+    print(page.url, flush=True)
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        page.server.stop()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

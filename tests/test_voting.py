@@ -1,0 +1,156 @@
+"""The three equations of the vote, its ties and empty contacts, and the contact semantic map."""
+
+import time
+from collections import Counter
+
+import pytest
+import torch
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dora.affordance.contact_map import contact_semantic_map, hand_contacts, wrist_matrix
+from dora.affordance.hand import HandModel
+from dora.affordance.map import AffordanceMap
+from dora.affordance.objects import load_object
+from dora.affordance.signed_distance import SignedDistanceField
+from dora.affordance.voting import NO_CONTACT, VotingSettings, vote
+from dora.errors import InputError
+from dora.robot import load_robot
+
+ENVIRONMENTS, CONTACTS = 128, 6
+
+
+@pytest.fixture(scope="module")
+def jug() -> AffordanceMap:
+    return AffordanceMap.from_object(load_object("jug"))
+
+
+def plain_vote(map: AffordanceMap, contacts, finger, settings: VotingSettings) -> int:
+    """The equations of the paper, read aloud, for one environment."""
+    neighbours = {}
+    for point, part in zip(contacts, finger.tolist(), strict=True):
+        if part > 0:
+            order = (map.points - point).norm(dim=-1).argsort()[: settings.neighbours]
+            neighbours.setdefault(part, []).extend(map.labels[order].tolist())
+    if not neighbours:
+        return NO_CONTACT
+    overall = Counter(label for labels in neighbours.values() for label in labels)
+
+    def best(score: dict[int, float]) -> int:
+        return max(score, key=lambda label: (score[label], overall[label], -label))
+
+    sums: dict[int, float] = {}
+    for part, labels in neighbours.items():
+        choice = best(Counter(labels))
+        sums[choice] = sums.get(choice, 0.0) + settings.weights[part - 1]
+    return best(sums)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 12), st.integers(1, 9))
+@settings(max_examples=40, deadline=None)
+def test_vote_is_the_three_equations(jug, seed, neighbours, contacts):
+    generator = torch.Generator().manual_seed(seed)
+    at = jug.points[torch.randint(len(jug), (8, contacts), generator=generator)]
+    at = at + 4e-3 * torch.randn(8, contacts, 3, generator=generator)
+    finger = torch.randint(0, 7, (8, contacts), generator=generator)
+    chosen = VotingSettings(neighbours=neighbours)
+    found = vote(jug, at, finger, chosen)
+    assert found.tolist() == [plain_vote(jug, *row, chosen) for row in zip(at, finger, strict=True)]
+
+
+def box_map(labels: list[int]) -> AffordanceMap:
+    """A map whose points are on a line 1 cm apart and have the given labels."""
+    count = len(labels)
+    points = torch.zeros(count, 3)
+    points[:, 0] = 0.01 * torch.arange(count)
+    normals = torch.tensor([[0.0, 0.0, 1.0]]).repeat(count, 1)
+    mesh = trimesh.creation.box((0.1, 0.1, 0.1))
+    return AffordanceMap(
+        name="line",
+        points=points,
+        normals=normals,
+        areas=torch.full((count,), 1e-4),
+        labels=torch.tensor(labels),
+        names=("a", "b", "c"),
+        mesh=mesh,
+        face_labels=torch.zeros(len(mesh.faces), dtype=torch.long).numpy(),
+        digest="",
+    )
+
+
+@pytest.mark.parametrize(
+    ("where", "finger", "expected"),
+    [
+        ([0.0, 0.05], [0, 0], NO_CONTACT),  # nothing touches
+        ([0.0, 0.05], [3, 0], 0),  # one finger on a
+        ([0.0, 0.05], [3, 2], 2),  # index on a, thumb on c: the thumb weighs more
+        ([0.0, 0.05, 0.0], [3, 2, 4], 0),  # 2 : 2, and more neighbours are a
+        ([0.0, 0.028], [3, 4], 0),  # 1 : 1, as many neighbours each: first name
+        ([0.0, 0.028, 0.028], [3, 4, 4], 1),  # 1 : 1, and more neighbours are b
+        ([0.0, 0.0, 0.028], [2, 2, 2], 0),  # mode within the thumb
+    ],
+)
+def test_ties_and_empty_contacts(where, finger, expected):
+    line = box_map([0, 0, 1, 1, 2, 2])
+    contacts = torch.zeros(1, len(where), 3)
+    contacts[0, :, 0] = torch.tensor(where)
+    assert vote(line, contacts, torch.tensor([finger]), VotingSettings(neighbours=2)).item() == expected
+
+
+def test_points_without_contact_are_not_looked_at(jug):
+    contacts = torch.full((2, 3, 3), torch.nan)
+    contacts[0, 0] = jug.points[0]
+    found = vote(jug, contacts, torch.tensor([[2, 0, 0], [0, 0, 0]]))
+    assert found.tolist() == [int(jug.labels[0]), NO_CONTACT]
+
+
+def test_no_contact_point_at_all(jug):
+    assert vote(jug, torch.zeros(2, 0, 3), torch.zeros(2, 0, dtype=torch.long)).tolist() == [NO_CONTACT] * 2
+
+
+def test_vote_is_cheap_enough_for_every_step(jug):
+    generator = torch.Generator().manual_seed(0)
+    at = jug.points[torch.randint(len(jug), (ENVIRONMENTS, CONTACTS), generator=generator)]
+    finger = torch.arange(1, CONTACTS + 1).repeat(ENVIRONMENTS, 1)
+    vote(jug, at, finger)
+    fastest = min(_seconds(jug, at, finger) for _ in range(20))
+    assert fastest < 2e-2  # 2 ms without the type checks of the tests; ten times that catches a wrong algorithm
+
+
+def _seconds(*arguments) -> float:
+    start = time.process_time()
+    vote(*arguments)
+    return time.process_time() - start
+
+
+@pytest.mark.parametrize("wrong", [{"neighbours": 0}, {"weights": (1.0, 1.0)}, {"weights": (0.0,) * 6}])
+def test_wrong_settings_are_refused(wrong):
+    with pytest.raises(InputError):
+        VotingSettings(**wrong)
+
+
+def test_contact_semantic_map_names_the_part_that_touches():
+    robot = load_robot("diana7_hit")
+    hand = HandModel(robot)
+    joints = torch.tensor(robot.postures["home"].hand).float()[None]
+    position, quaternion = torch.tensor([[0.1, 0.2, 0.3]]), torch.tensor([[0.5, 0.5, -0.5, 0.5]])
+    poses = hand.forward(wrist_matrix(position, quaternion), robot.reduce_hand(joints))
+    points = hand.place(poses, hand.contacts)[0]
+    found = contact_semantic_map(points, position, quaternion, joints, hand)
+    assert (found[0] == hand.contact_part).float().mean() > 0.97
+    assert (contact_semantic_map(points + 0.5, position, quaternion, joints, hand) == 0).all()
+
+
+def test_hand_contacts_lie_on_the_object():
+    hand = HandModel(load_robot("diana7_hit"), dtype=torch.float64)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
+    field = SignedDistanceField(ball, dtype=torch.float64)
+    wrist = torch.eye(4, dtype=torch.float64)[None].clone()
+    wrist[0, :3, 3] = -torch.tensor(hand.grip.center + 0.022 * hand.grip.normal)
+    poses = hand.forward(wrist, torch.zeros_like(hand.lower)[None])
+    points, part = hand_contacts(hand, field, poses)
+    touching = points[part > 0]
+    assert len(touching) > 0
+    assert (touching.norm(dim=-1) - 0.03).abs().max() < 1e-3
+    assert points.shape[:2] == part.shape == (1, len(hand.contacts.body.unique()))
