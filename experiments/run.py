@@ -12,7 +12,7 @@ import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -40,6 +40,10 @@ class Args:
     """Learner (default ppo)."""
     guidance: Literal["affordance", "none"] | None = None
     """Use affordance maps and grasp candidates, or nothing of them (default affordance)."""
+    guidance_parts: tuple[Literal["observation", "reward", "filter", "prior"], ...] | None = None
+    """Parts of guidance in force, for ablations (default all)."""
+    preset: Literal["none", "standard", "hard"] | None = None
+    """How much episodes are randomised and disturbed (default standard)."""
     seed: int | None = None
     """Seed of weights, exploration and initial states (default 0)."""
     total_steps: int | None = None
@@ -68,6 +72,12 @@ class Args:
     """Correlation of the exploration noise of successive steps, 0 to below 1."""
 
 
+def task_options(args: Args) -> dict[str, Any]:
+    """The arguments of the task that are given."""
+    given = {"preset": args.preset, "guidance_parts": args.guidance_parts and list(args.guidance_parts)}
+    return {name: value for name, value in given.items() if value is not None}
+
+
 def settings(args: Args) -> RunConfig:
     """Settings for a new run."""
     if args.env is None:
@@ -83,6 +93,7 @@ def settings(args: Args) -> RunConfig:
         final_episodes=args.episodes,
         eval_every=args.eval_every,
         stop_success=args.stop_success,
+        task=task_options(args),
         learner={"noise_correlation": args.noise_correlation},
     )
 
@@ -99,6 +110,7 @@ def resumed_settings(args: Args, config: RunConfig) -> RunConfig:
         "final_episodes": args.episodes,
         "eval_every": args.eval_every,
         "stop_success": args.stop_success,
+        "task": task_options(args) or None,
     }
     for name, value in asked.items():
         if value is not None and value != getattr(config, name):
@@ -129,7 +141,7 @@ def train(args: Args) -> tuple[Path, bool]:
         check_task_id(config.env)
         folder = RunFolder(args.out or default_folder(config))
         folder.create(config)
-    make_task_batch = functools.partial(make_task, config.env, guidance=config.guidance)
+    make_task_batch = functools.partial(make_task, config.env, guidance=config.guidance, **config.task)
     trainer = Trainer(config, make_task_batch, folder, resume=args.resume is not None)
     result = trainer.run()
     if not result["finished"]:
@@ -149,10 +161,10 @@ def evaluate_only(args: Args) -> Path:
     asked = {"agent": args.agent or theirs.agent, "guidance": args.guidance or theirs.guidance}
     config = recommended(
         args.env or theirs.env, **asked, seed=theirs.seed, num_envs=theirs.num_envs, workers=theirs.workers,
-        final_episodes=args.episodes, total_steps=theirs.total_steps,
+        final_episodes=args.episodes, total_steps=theirs.total_steps, task=theirs.task | task_options(args),
     )  # fmt: skip
     check_task_id(config.env)
-    make_task_batch = functools.partial(make_task, config.env, guidance=config.guidance)
+    make_task_batch = functools.partial(make_task, config.env, guidance=config.guidance, **config.task)
     checkpoint, evaluation, zero = evaluate_checkpoint(path, config, make_task_batch)
     folder = RunFolder(args.out or default_folder(config, "-eval"))
     folder.create(config)
@@ -176,7 +188,8 @@ def evaluate_only(args: Args) -> Path:
 def film(checkpoint: Path, config: RunConfig, path: Path) -> None:
     """Film the policy of a checkpoint, or say in one line why not."""
     policy = load_policy(read_checkpoint(checkpoint), checkpoint)
-    make_single_task = functools.partial(make_task, config.env, 1, config.guidance, render_mode="rgb_array")
+    options = config.task | {"render_mode": "rgb_array"}
+    make_single_task = functools.partial(make_task, config.env, 1, config.guidance, **options)
     try:
         record(make_single_task, policy.greedy, path, VIDEO_EPISODES)
     except (RuntimeError, InputError) as error:

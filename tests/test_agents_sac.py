@@ -6,6 +6,7 @@ from torch import Tensor
 
 from dora.agents.config import SACConfig
 from dora.agents.networks import TanhActor
+from dora.agents.presets import recommended
 from dora.agents.sac import SAC, multi_step
 
 ROWS, LENGTH, OBSERVATION, ACTION = 4, 16, 3, 2
@@ -111,3 +112,10 @@ def test_prior_pulls_the_mean_towards_no_correction():
             values = learner.update(batch())
         sizes.append(values["correction"])
     assert sizes[1] < 0.3 * sizes[0]
+
+
+def test_only_guided_runs_are_pulled_to_the_prior():
+    prior = {name: recommended("DoraCube-v1", "sac", guidance=name).learner for name in ("affordance", "none")}
+    assert prior["affordance"] == SACConfig()
+    assert prior["none"] == SACConfig(prior=0.0)
+    assert recommended("DoraCube-v1", "sac", guidance="none", learner={"prior": 0.2}).learner == SACConfig(prior=0.2)

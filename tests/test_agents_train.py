@@ -80,11 +80,11 @@ def test_ppo_learns_and_leaves_a_complete_folder(tmp_path: Path):
 
 def test_sac_learns(tmp_path: Path):
     learner = SACConfig(
-        batch=128, updates_per_step=1 / 16, warmup=500, critic_only=50, prior=0.0, log_std_max=-0.4,
+        batch=64, updates_per_step=1 / 8, warmup=500, critic_only=50, n_step=3, prior=0.0, log_std_max=-0.4,
         learning_rate=2e-3, learning_rate_actor=2e-3, hidden=(64, 64), capacity=20_000,
     )  # fmt: skip
     config = dataclasses.replace(
-        BASE, agent="sac", guidance="none", total_steps=14_000, eval_every=3_500, learner=learner
+        BASE, agent="sac", guidance="none", total_steps=10_500, eval_every=3_500, learner=learner
     )
     result = run(tmp_path / "run", config)
     assert result["success_rate"] > 0.9

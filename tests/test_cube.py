@@ -1,10 +1,10 @@
 """DoraCube-v1: its geometry on invented states, and what its scripted grasp is worth."""
 
-from dataclasses import fields
 from math import pi, sin
 
 import pytest
 import torch
+from invented import invented
 from torch import Tensor
 
 import dora.tasks as tasks
@@ -20,29 +20,6 @@ STILL = 0.002
 SHAKE_STEPS = 48
 SHAKE_PERIOD = 8
 """Period of the shake [control steps]."""
-
-SIZES = {
-    "arm_q": 7, "hand_q": 20, "hand_v": 20, "hand_target": 20, "wrist_q": 4, "object_q": 4, "goal_q": 4,
-    "touch": 6, "force": 6, "action": 26, "previous_action": 26, "correction": 26,
-    "goal_pregrasp": 20, "goal_grasp": 20, "phase": 4, "contact_finger": 0,
-}  # fmt: skip
-SCALARS = ("supported", "penetration", "deepest", "stage", "time")
-
-
-def invented(n: int, **given: Tensor) -> Snapshot:
-    """A snapshot of zeros, unit quaternions and 3 cm cubes, with what is given."""
-    values: dict[str, Tensor] = {}
-    for f in fields(Snapshot):
-        shape = (n,) if f.name in SCALARS else (n, SIZES.get(f.name, 3))
-        values[f.name] = torch.zeros(shape)
-        if f.name.endswith("_q") and SIZES.get(f.name) == 4:
-            values[f.name][:, 0] = 1.0
-    values |= {"tip_p": torch.zeros(n, 5, 3), "tip_q": torch.tensor([1.0, 0, 0, 0]).repeat(n, 5, 1)}
-    values |= {"near_p": torch.zeros(n, 3, 3), "near_q": values["tip_q"][:, :3], "contact_p": torch.zeros(n, 0, 3)}
-    values |= {k: values[k].bool() for k in ("touch", "supported")}
-    values |= {k: values[k].long() for k in ("stage", "contact_finger")}
-    values["object_half"] = torch.full((n, 3), cube.HALF)
-    return Snapshot(**(values | given))
 
 
 def test_surface_distance_is_that_of_a_box():

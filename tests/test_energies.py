@@ -166,7 +166,6 @@ def test_table_keeps_the_hand_above_it(hand, energy):
 
 
 def test_crossed_fingers_penetrate_and_an_open_hand_does_not(hand, energy):
-    _, _, contacts = draw(hand)
     joints = torch.zeros(2, len(hand.lower), dtype=DOUBLE)
     joints[1] = torch.where(hand.lower < 0, 0.0, hand.upper)
     joints[1, :3] = hand.upper[:3]

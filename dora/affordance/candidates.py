@@ -45,7 +45,7 @@ class GraspCandidates:
         penetration: (c,) deepest overlap of hand and object at `joints` [m]; nan = not measured.
         self_penetration: (c,) deepest overlap of the hand with itself at `joints` [m]; nan = not measured.
         valid: (c,) whether the grasp passed its validation; true if not given.
-        score: (c,) share of executed lifts that succeeded; nan = not ranked.
+        score: (c,) share of executions that succeeded; nan = not ranked.
         digest: digest of the object's geometry and labels; "" = unknown.
         robot: name of the robot; "" = unknown.
         robot_digest: `hand_digest` of the robot; "" = unknown.

@@ -110,7 +110,8 @@ def _outside_of_others(
 def _signed_distance(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Distance (m) to a watertight surface, negative inside."""
     vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
-    return igl.signed_distance(np.array(points), vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)[0]
+    signed = igl.signed_distance(np.array(points), vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)
+    return np.asarray(signed[0])
 
 
 def _run(mesh: trimesh.Trimesh, threshold: float) -> list[trimesh.Trimesh]:

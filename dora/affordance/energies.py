@@ -5,7 +5,7 @@
 | closure | E_DFC | ||G c||^2 at the hand's contact points, c the object's inward normals there |
 | distance | E_HO | sum over contact points of abs(signed distance) (m), times `PALM_IMPORTANCE` for the palm |
 | region | E_HO | sum over contact points of the distance to the region to be held (m) |
-| closing | E_HO | sum over contact points on fingers by how much they miss the object when the hand closes a little (m) |
+| closing | E_HO | sum over contact points on fingers of their miss when the hand closes a little (m) |
 | penetration | E_HO | sum over the hand's spheres of their overlap with the object and a thin skin around it (m) |
 | table | E_HO | sum over the spheres of their depth below the table plus a clearance (m) |
 | limits | E_Robot | sum over the joints of the angle beyond a limit (rad) |
@@ -237,9 +237,7 @@ class GraspEnergy:
 
     def close_pairs(
         self, poses: Float[Tensor, "c b 4 4"]
-    ) -> tuple[
-        Int[Tensor, " n"], Int[Tensor, "2 n"], Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, " n"]
-    ]:
+    ) -> tuple[Int[Tensor, " n"], Int[Tensor, "2 n"], Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, " n"]]:
         """Pairs of capsules that may overlap: row, capsules, nearest points of their axes, gap of surfaces (m)."""
         ends = self.hand.place(poses, self.hand.ends)
         ends = ends - poses[:, None, 0, :3, 3]

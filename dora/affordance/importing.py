@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import trimesh
@@ -113,7 +113,7 @@ def read_mesh(path: Path, keep_order: bool = False) -> tuple[trimesh.Trimesh, li
     return mesh, [name for name, part in parts for _ in range(len(part.faces))]
 
 
-def _load(path: Path, options: dict[str, bool]) -> trimesh.Scene:
+def _load(path: Path, options: dict[str, Any]) -> trimesh.Scene:
     """What trimesh reads; `options` are for OBJ files alone."""
     own = options if path.suffix.lower() == ".obj" else {}
     try:

@@ -61,11 +61,10 @@ class InitialPoses:
         self.frame = self.points.new_tensor(np.stack((hand.grip.normal, hand.grip.across, hand.grip.along)).copy())
         self.center = self.points.new_tensor(hand.grip.center)
 
-    def draw(
-        self, count: int, generator: torch.Generator
-    ) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c a"]]:
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c a"]]:
         """Wrist poses in the object frame and actuated joints (rad)."""
         spread, new = self.spread, self.points
+
         def normal(*shape: int) -> Tensor:
             return torch.randn(*shape, generator=generator).to(new)
 

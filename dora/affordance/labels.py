@@ -151,14 +151,14 @@ SHAPES = {"box": ("min", "max"), "plane": ("point", "normal")}
 def _inside(path: Path, name: str, shape: Any, centers: Float[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
     """Which centres lie in a region, or in one of a list of regions."""
     if isinstance(shape, list) and shape:
-        return np.any([_inside(path, name, each, centers) for each in shape], axis=0)
+        return np.logical_or.reduce([_inside(path, name, each, centers) for each in shape])
     for kind, keys in SHAPES.items():
         if isinstance(shape, dict) and list(shape) == [kind] and isinstance(shape[kind], dict):
             vectors = [np.array(shape[kind].get(key, ()), np.float64) for key in keys]
             if len(shape[kind]) == 2 and all(v.shape == (3,) and np.isfinite(v).all() for v in vectors):
                 first, second = vectors
                 if kind == "box":
-                    return ((centers >= first) & (centers <= second)).all(1)
+                    return np.logical_and.reduce((centers >= first) & (centers <= second), axis=1)
                 return (centers - first) @ second > 0
     raise InputError(
         f"region {name!r} of {path} must be box: {{min: [x, y, z], max: [x, y, z]}} or "

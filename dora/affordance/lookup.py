@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 CHUNK = 512
@@ -47,7 +47,7 @@ class NearestTable:
         axes = [torch.arange(int(n), device=points.device) for n in self.shape]
         cells = torch.cartesian_prod(*axes)
         centers = self.low + (cells + 0.5) * edge
-        tree = cKDTree(points.cpu().numpy())
+        tree = KDTree(points.cpu().numpy())
         near = torch.from_numpy(tree.query(centers.cpu().numpy(), distance_upper_bound=self.BAND * edge)[0]).isfinite()
         near = near.to(points.device)
         self.row = torch.where(near, near.long().cumsum(0) - 1, -1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import cast
 
 import imageio.v3 as imageio
 import numpy as np
@@ -29,7 +30,7 @@ VIEWS = ((-1.0, 0.35), (2.4, 0.35))
 """Azimuth and elevation (rad) of the pictures."""
 DISC_CORNERS, DISC_SHARE, DISC_LIFT = 8, 0.85, 2e-4
 """Corners of a point's disc, its radius as a share of that with its area, and its distance (m) from the surface."""
-CANDIDATES_PER_NEIGHBOUR, FEWEST_CANDIDATES = 4, 32
+CANDIDATES_PER_NEIGHBOUR, FEWEST_CANDIDATES = 6, 48
 """Points that a cell of the table knows: this many per neighbour asked for, and at least the second."""
 
 
@@ -210,7 +211,7 @@ class AffordanceMap:
 
     def export_glb(self, path: Path | str) -> None:
         """Write the painted surface as binary glTF (m), which every 3D viewer shows; raises InputError as `save`."""
-        write_bytes(Path(path), trimesh.exchange.gltf.export_glb(trimesh.Scene(self.painted())))
+        write_bytes(Path(path), cast(bytes, trimesh.Scene(self.painted()).export(file_type="glb")))
 
     @classmethod
     def load(cls, path: Path | str, obj: AffordanceObject | None = None) -> AffordanceMap:
@@ -222,9 +223,12 @@ class AffordanceMap:
         tensors, metadata = read_tensors(Path(path), FORMAT)
         if obj is not None and metadata["digest"] != obj.digest:
             raise InputError(f"{path} is the map of another shape or labelling than {obj.name}: make it again.")
-        vertices, faces, face_labels = (tensors.pop(key).numpy() for key in ("vertices", "faces", "face_labels"))
+        vertices, faces, face_labels = (tensors[key].numpy() for key in ("vertices", "faces", "face_labels"))
         return cls(
-            **tensors,
+            points=tensors["points"],
+            normals=tensors["normals"],
+            areas=tensors["areas"],
+            labels=tensors["labels"],
             name=metadata["name"],
             names=tuple(metadata["names"]),
             mesh=trimesh.Trimesh(vertices, faces, process=False),

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 OVERSAMPLING = 5
 """Random points drawn for every point kept."""
@@ -37,7 +37,7 @@ def sample_evenly(
     radius = float(np.sqrt(mesh.area / (2 * np.sqrt(3) * count)))
     kept = _eliminate(_crowding(points, normals, 2 * radius), count)
     others, other_faces = trimesh.sample.sample_surface(mesh, AREA_SAMPLES * count, seed=rng)[:2]
-    tree = cKDTree(np.concatenate([points[kept], radius * normals[kept]], axis=1))
+    tree = KDTree(np.concatenate([points[kept], radius * normals[kept]], axis=1))
     nearest = tree.query(np.concatenate([others, radius * mesh.face_normals[other_faces]], axis=1))[1]
     areas = np.bincount(nearest, minlength=count) * (mesh.area / len(others))
     return points[kept], faces[kept], areas
@@ -45,7 +45,7 @@ def sample_evenly(
 
 def _crowding(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], reach: float) -> csr_matrix:
     """Weight (1 - distance / reach)^alpha of every pair of points on the same side of the surface."""
-    tree = cKDTree(points)
+    tree = KDTree(points)
     pairs = tree.query_pairs(reach, output_type="ndarray")
     first, second = pairs[np.einsum("nd,nd->n", normals[pairs[:, 0]], normals[pairs[:, 1]]) > OPPOSITE].T
     distance = np.linalg.norm(points[first] - points[second], axis=1)

@@ -31,7 +31,7 @@ COARSENING = 4
 BAND = 0.01
 """Nodes within this distance (m) of the surface are exact."""
 MAX_NODES = 1.6e7
-"""Largest grid, whose nodes float32 can still count; an object for which it would be larger is absurdly large for a hand."""
+"""Largest grid, whose nodes float32 can still count; a larger object is absurdly large for a hand."""
 CHANNELS = 4
 """Columns of a field's table without the region: distance (m) and unit gradient (3,)."""
 _TINY = 1e-12

@@ -17,6 +17,8 @@ from dora.robot.shapes import Shape
 
 AROUND = 24
 """Divisions around a cylinder or capsule as a mesh."""
+FIT_STEPS = 20
+"""Steps of the fit; after them corners still slide along the path, but the polyline comes no nearer to it."""
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 """Turn (rad) between directions of a spiral that spreads evenly over a sphere."""
 
@@ -144,7 +146,7 @@ def fitted(path: Float[np.ndarray, "m d"], corners: Float[np.ndarray, "k d"]) ->
         along = np.einsum("mkd,kd->mk", path[:, None] - start, chord) / np.einsum("kd,kd->k", chord, chord)
         return np.linalg.norm(path[:, None] - start - np.clip(along, 0, 1)[..., None] * chord, axis=-1).min(1)
 
-    return polyline(least_squares(distance, corners[1:-1].ravel()).x)
+    return polyline(least_squares(distance, corners[1:-1].ravel(), max_nfev=FIT_STEPS).x)
 
 
 def hull_of(points: Float[np.ndarray, "n 3"], vertices: int) -> trimesh.Trimesh:

@@ -133,7 +133,8 @@ def _fill(mesh: trimesh.Trimesh, labels: np.ndarray) -> tuple[trimesh.Trimesh, n
     edges = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
     face_of = dict(zip(map(tuple, mesh.edges.tolist()), mesh.edges_face.tolist(), strict=True))
     rims = nx.DiGraph(edges[:, ::-1].tolist())
-    vertices, faces, new_labels, holes = [mesh.vertices], [mesh.faces], [labels], 0
+    vertices, faces, new_labels = [np.array(mesh.vertices)], [np.array(mesh.faces)], [labels]
+    holes = 0
     for rim in nx.weakly_connected_components(rims):
         around = rims.subgraph(rim)
         if any(d != 1 for _, d in around.out_degree()) or any(d != 1 for _, d in around.in_degree()):

@@ -131,13 +131,23 @@ class RunConfig:
     """Observations after which the observation normaliser stays as it is."""
     stagger: bool = True
     """End the first episodes at random steps, so that resets spread over time."""
+    task: dict[str, Any] = field(default_factory=dict)
+    """Further arguments of the task, such as `preset` and `guidance_parts`."""
     learner: PPOConfig | SACConfig = field(default_factory=PPOConfig)
     """Settings of the learner."""
+
+    @property
+    def has_prior(self) -> bool:
+        """Whether actions correct a reference, so that zero actions are a policy worth measuring."""
+        parts = self.task.get("guidance_parts")
+        return self.guidance == "affordance" and (parts is None or "prior" in parts)
 
     def digest(self) -> str:
         """Twelve hexadecimal digits that differ between settings; `total_steps` may grow and is left out."""
         content = dataclasses.asdict(self)
         del content["total_steps"]
+        if not content["task"]:
+            del content["task"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
 
 

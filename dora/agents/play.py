@@ -55,7 +55,7 @@ def evaluate_checkpoint(
         policy = load_policy(checkpoint, path)
         evaluation = evaluate(env, policy.greedy, config.final_episodes, FINAL_SEED)
         zero = None
-        if config.guidance == "affordance":
+        if config.has_prior:
             zero = evaluate(env, no_correction(action_size), config.final_episodes, FINAL_SEED)
         return checkpoint, evaluation, zero
     finally:

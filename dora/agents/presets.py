@@ -28,6 +28,9 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
 }
 """Differences from the defaults of `RunConfig`, and under `learner` from those of the learner."""
 
+UNGUIDED: dict[str, dict[str, Any]] = {"sac": {"prior": 0.0}}
+"""Settings of each learner without guidance, where zero action is no prior to be pulled to."""
+
 POSITIVE = ("total_steps", "num_envs", "eval_every", "eval_episodes", "final_episodes", "eval_envs")
 
 
@@ -45,11 +48,12 @@ def recommended(env: str, agent: str, **overrides: Any) -> RunConfig:
     if agent not in SINGLE_ARM_AGENTS:
         raise InputError(f"The learner {agent} needs a task with two arms and {env} has one: use --agent ppo or sac.")
     preset = dict(PRESETS.get((env, agent), {}))
-    learner = preset.pop("learner", {}) | {
-        k: v for k, v in (overrides.pop("learner", None) or {}).items() if v is not None
-    }
+    learner, given = preset.pop("learner", {}), overrides.pop("learner", None) or {}
     fields = {"guidance": "affordance", "workers": available_cores()} | preset
     fields |= {name: value for name, value in overrides.items() if value is not None}
+    if fields["guidance"] == "none":
+        learner = learner | UNGUIDED.get(agent, {})
+    learner = learner | {name: value for name, value in given.items() if value is not None}
     config = RunConfig(env=env, agent=agent, learner=LEARNER_CONFIGS[agent](**learner), **fields)
     check(config)
     return config

@@ -260,7 +260,7 @@ class Trainer:
         episodes = self.config.final_episodes
         evaluation = self._run_evaluation(episodes, FINAL_SEED, self._greedy, interrupt)
         zero = None
-        if self.config.guidance == "affordance":
+        if self.config.has_prior:
             zero = self._run_evaluation(episodes, FINAL_SEED, no_correction(self.sizes[1]), interrupt)
         self._spend("evaluate", time.perf_counter() - start)
         return evaluation, zero

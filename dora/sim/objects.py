@@ -1,6 +1,7 @@
 """Objects with affordances as bodies of a simulation: convex pieces to collide, the mesh to look at."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import sapien
@@ -54,7 +55,7 @@ def object_entity(
             raise InputError(f"{obj.name}: {name} is {value}; it must be positive.")
     entity = sapien.Entity()
     entity.name = obj.name
-    body = physx.PhysxRigidDynamicComponent()
+    body: Any = physx.PhysxRigidDynamicComponent()
     for index, piece in enumerate(obj.pieces):
         try:
             shape = collision_shape(piece.shape, physx.PhysxMaterial(friction, friction, 0.0), scale)
@@ -98,7 +99,7 @@ class ObjectBuilder(ActorBuilder):
 
     def __init__(self, scene: ManiSkillScene, obj: AffordanceObject, **settings: float | None):
         super().__init__()
-        self.set_scene(scene)
+        self.scene: Any = scene
         self._object, self._settings = obj, settings
 
     def build_entity(self) -> sapien.Entity:

@@ -112,7 +112,7 @@ class LiftTest:
         before, above = -e.standoff * lift.approach @ turn, np.array([0.0, 0.0, e.height]) @ turn
         grasp = np.zeros(3)
         rig.stage(*self.rest, lift.mass, lift.friction)
-        rig.hand.reset(lift.pregrasp, sapien.Pose(lift.position, lift.quaternion), before)
+        rig.hand.reset(lift.pregrasp, sapien.Pose(lift.position.tolist(), lift.quaternion.tolist()), before)
         if not self._move(before, grasp):
             return False
         self._close(lift)
@@ -139,7 +139,7 @@ class LiftTest:
         pose, grip = self.rig.pose, self.rig.read_grip()
         cosine = min(1.0, abs(float(np.dot(pose.q, self.rest[1]))))
         up = float(pose.p[2] - self.rest[0][2]) > self.execution.lifted
-        return up and grip.held and 2 * np.arccos(cosine) < self.execution.turn
+        return up and grip.held and bool(2 * np.arccos(cosine) < self.execution.turn)
 
 
 def rank(
@@ -175,12 +175,12 @@ def rank(
     """
     check_object(candidates, obj)
     execution = execution or Execution()
-    lifts = _lifts(candidates, obj, execution, np.random.default_rng([seed, _STREAM[purpose]]))
+    lifts = lifts_of(candidates, obj, execution, np.random.default_rng([seed, _STREAM[purpose]]))
     done = run_cases(LiftTest, (obj, robot, execution, physics or Physics()), lifts, processes, progress)
     return torch.tensor(done, dtype=torch.float32).view(len(candidates), execution.draws).mean(1)
 
 
-def _lifts(
+def lifts_of(
     candidates: GraspCandidates, obj: AffordanceObject, execution: Execution, random: np.random.Generator
 ) -> list[Lift]:
     """All executions, candidate by candidate."""

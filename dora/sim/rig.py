@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import sapien
@@ -52,7 +53,8 @@ def _gravity(gravity: Sequence[float]):
     """SAPIEN gives a new physics system the global scene settings: change them for a moment."""
     before = physx.get_scene_config()
     kept = (before.gravity.copy(), before.enable_tgs)
-    physx.set_scene_config(gravity=np.array(gravity, np.float32), enable_tgs=True)
+    settings: dict[str, Any] = {"gravity": np.array(gravity, np.float32), "enable_tgs": True}
+    physx.set_scene_config(**settings)
     try:
         yield
     finally:
@@ -96,7 +98,7 @@ class Rig:
         iterations = physics.position_iterations, physics.velocity_iterations
         self.hand = FloatingHand(self._scene, robot, friction, iterations, carriage)
         self._entity = object_entity(obj, friction=friction, contact_offset=physics.contact_offset)
-        self.body = self._entity.find_component_by_type(physx.PhysxRigidDynamicComponent)
+        self.body: Any = self._entity.find_component_by_type(physx.PhysxRigidDynamicComponent)
         self.body.set_solver_position_iterations(iterations[0])
         self.body.set_solver_velocity_iterations(iterations[1])
         self._scene.add_entity(self._entity)
@@ -108,8 +110,7 @@ class Rig:
         self.read_grip = GripReader(system.get_contacts, self.body, self.hand.part_of, system.timestep).read
 
     def _add_table(self, friction: float) -> None:
-        half = np.array(TABLE_HALF, np.float32)
-        shape = physx.PhysxCollisionShapeBox(half, physx.PhysxMaterial(friction, friction, 0.0))
+        shape = physx.PhysxCollisionShapeBox(list(TABLE_HALF), physx.PhysxMaterial(friction, friction, 0.0))
         shape.local_pose = sapien.Pose([0.0, 0.0, -TABLE_HALF[2]])
         self._materials.append(shape.physical_material)
         top = physx.PhysxRigidStaticComponent()
@@ -120,7 +121,7 @@ class Rig:
 
     def place(self, position: np.ndarray, quaternion: np.ndarray) -> None:
         """Puts the object at rest, origin (3,) [m] and orientation wxyz (4,) in the world."""
-        self._entity.set_pose(sapien.Pose(position, quaternion))
+        self._entity.set_pose(sapien.Pose(position.tolist(), quaternion.tolist()))
         self.body.set_linear_velocity(_ZERO)
         self.body.set_angular_velocity(_ZERO)
 
@@ -150,7 +151,7 @@ class Rig:
     @property
     def position(self) -> np.ndarray:
         """The object's centre of mass (3,) in the world [m]."""
-        return self._entity.pose.p
+        return np.asarray(self._entity.pose.p)
 
     @property
     def pose(self) -> sapien.Pose:

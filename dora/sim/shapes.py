@@ -10,7 +10,7 @@ from sapien import physx
 from dora.robot.shapes import Shape
 
 _PRIMITIVES: dict[str, Callable[[list[float], physx.PhysxMaterial], physx.PhysxCollisionShape]] = {
-    "box": lambda size, material: physx.PhysxCollisionShapeBox(np.array(size, np.float32), material),
+    "box": lambda size, material: physx.PhysxCollisionShapeBox(size, material),
     "sphere": lambda size, material: physx.PhysxCollisionShapeSphere(size[0], material),
     "cylinder": lambda size, material: physx.PhysxCollisionShapeCylinder(size[0], size[1], material),
     "capsule": lambda size, material: physx.PhysxCollisionShapeCapsule(size[0], size[1], material),
@@ -32,7 +32,7 @@ def collision_shape(
     """
     if isinstance(shape, trimesh.Trimesh):
         points = np.asarray(shape.vertices * scale, np.float32)
-        return physx.PhysxCollisionShapeConvexMesh(points, np.ones(3, np.float32), material)
+        return physx.PhysxCollisionShapeConvexMesh(points, [1.0, 1.0, 1.0], material)
     made = _PRIMITIVES[shape.kind]([scale * length for length in shape.size], material)
     made.local_pose = sapien.Pose([scale * x for x in shape.position], shape.quaternion)
     return made

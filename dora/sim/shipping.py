@@ -1,34 +1,45 @@
-"""Make the set of grasps that comes with Dora: searched, validated, ranked by executed lifts, best first."""
+"""Make the set of grasps that comes with Dora: searched, filtered, validated, ranked by execution, best first."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from dora.affordance.approach import free_approaches
 from dora.affordance.candidates import GraspCandidates, concatenate
 from dora.affordance.objects import load_object
+from dora.affordance.optimise import OFF_TABLE, Settings, optimise
+from dora.affordance.protocol import STANDARD
+from dora.affordance.reach import Reach
 from dora.affordance.shipped import ROBOT, shipped_path
 from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
 from dora.progress import PhaseProgress
 from dora.robot import RobotDescription, load_robot
-from dora.sim.grasps import generate
-from dora.sim.ranking import rank
+from dora.robot.rotations import quaternion_from_rotation_vector, quaternion_multiply
+from dora.sim.ranking import Execution, rank
+from dora.sim.validation import validate
 
-ROUND = 256
-"""Candidates searched at a time."""
-MOST_ROUNDS = 8
+ROUND = 192
+"""Candidates searched at a time for the target region."""
+MOST_ROUNDS = 12
 """Rounds after which a region has to have enough."""
-POOL = 224
-"""Valid grasps of the target region that are ranked."""
-KEPT = 128
+POOL = 128
+"""Grasps of the target region that are ranked."""
+KEPT = 96
 """The best of them that are shipped."""
 FEWEST = 64
 """Grasps of the target region below which nothing is shipped."""
 OTHERS = 64
-"""Candidates searched for each other region; the valid ones are shipped."""
+"""Candidates searched for each other region."""
+OTHERS_KEPT = 32
+"""The best of them that are shipped."""
 
 
 def ship(name: str, seed: int, phases: PhaseProgress) -> Path:
@@ -42,52 +53,95 @@ def ship(name: str, seed: int, phases: PhaseProgress) -> Path:
     Raises:
         InputError: unknown object, or too few valid grasps.
     """
-    obj, robot = load_object(name), load_robot(ROBOT)
-    target = target_grasps(obj, robot, seed, phases)
-    others = [
-        found
-        for index, label in enumerate(obj.labels)
-        if label != obj.target
-        and (found := valid_grasps(obj, robot, OTHERS, seed + MOST_ROUNDS + index, label, phases)) is not None
-    ]
-    chosen = [
-        ranked(part, obj, robot, phases, f"{name}: ranking {part.grasp_class[0]}").select(slice(KEPT))
-        for part in (target, *others)
-    ]
+    maker = SetMaker(load_object(name), load_robot(ROBOT), phases)
     path = shipped_path(name)
     path.parent.mkdir(exist_ok=True)
-    concatenate(chosen).save(path)
+    maker.make(seed).save(path)
     return path
 
 
-def target_grasps(obj: AffordanceObject, robot: RobotDescription, seed: int, phases: PhaseProgress) -> GraspCandidates:
-    """At least `FEWEST` and about `POOL` valid grasps of the target region; InputError if there are fewer."""
-    sets: list[GraspCandidates] = []
-    for index in range(MOST_ROUNDS):
-        found = valid_grasps(obj, robot, ROUND, seed + index, obj.target, phases)
-        sets += [] if found is None else [found]
-        if sum(map(len, sets)) >= POOL:
-            break
-    count = sum(map(len, sets))
-    if count < FEWEST:
-        raise InputError(f"{obj.name}: only {count} grasps of {obj.target!r} are valid; {FEWEST} are needed.")
-    return concatenate(sets)
+class SetMaker:
+    """Makes the shipped set of one object for one robot."""
+
+    def __init__(self, obj: AffordanceObject, robot: RobotDescription, phases: PhaseProgress) -> None:
+        self.obj, self.robot, self.phases = obj, robot, phases
+        self.reach = Reach(robot, obj)
+        self.on_table = obj.name not in OFF_TABLE
+
+    def make(self, seed: int) -> GraspCandidates:
+        """The best grasps of the target region, then those of the others; InputError if there are too few."""
+        parts = [self.ranked(self.pool(seed)).select(slice(KEPT))]
+        for index, label in enumerate(self.obj.labels):
+            if label != self.obj.target:
+                found = self.valid(OTHERS, seed + MOST_ROUNDS + index, label)
+                parts += [] if found is None else [self.ranked(found).select(slice(OTHERS_KEPT))]
+        made = {"search": repr(Settings()), "protocol": repr(STANDARD), "ranking": repr(Execution()), "seed": seed}
+        return replace(concatenate(parts), settings=json.dumps(made))
+
+    def pool(self, seed: int) -> GraspCandidates:
+        """`POOL` valid grasps of the target region, or as many as there are."""
+        sets: list[GraspCandidates] = []
+        for index in range(MOST_ROUNDS):
+            found = self.valid(ROUND, seed + index, self.obj.target)
+            sets += [] if found is None else [found]
+            if sum(map(len, sets)) >= POOL:
+                break
+        count = sum(map(len, sets))
+        if count < FEWEST:
+            name, target = self.obj.name, self.obj.target
+            raise InputError(f"{name}: only {count} grasps of {target!r} are valid, and {FEWEST} are needed.")
+        return concatenate(sets).select(slice(POOL))
+
+    def valid(self, num: int, seed: int, label: str) -> GraspCandidates | None:
+        """Those of `num` candidates that hold `label`, are free on an approach and strictly valid; None if none is."""
+        found = optimise(
+            self.obj, self.robot, num, seed, label, progress=self.phase(f"search {label}", 1 / Settings().iterations)
+        )
+        name = self.obj.classes[self.obj.label_index(label)]
+        good = found.valid & (found.self_penetration < STANDARD.strict_self_penetration) & found.of_class(name)
+        if not good.any():
+            return None
+        found, free = free_approaches(found.select(good), self.reach)
+        if self.on_table:
+            if not free.any():
+                return None
+            found = found.select(free)
+        verdict = validate(found, self.obj, self.robot, progress=self.phase(f"validate {label}"))
+        return found.select(verdict.strict) if verdict.strict.any() else None
+
+    def ranked(self, candidates: GraspCandidates) -> GraspCandidates:
+        """With scores, best first: by lifts from the table, or by holds in the air of what is not on one."""
+        report = self.phase(f"rank {candidates.grasp_class[0]}")
+        if self.on_table:
+            score = rank(candidates, self.obj, self.robot, progress=report)
+        else:
+            score = holds(candidates, self.obj, self.robot, report)
+        order = torch.argsort(score, descending=True, stable=True)
+        return replace(candidates, score=score).select(order)
+
+    def phase(self, name: str, scale: float = 1.0) -> Callable[[int, int], None]:
+        """A progress bar."""
+        return self.phases.phase(f"{self.obj.name}: {name}", "candidates", scale)
 
 
-def valid_grasps(
-    obj: AffordanceObject, robot: RobotDescription, num: int, seed: int, region: str, phases: PhaseProgress
-) -> GraspCandidates | None:
-    """Those of `num` candidates that are strictly valid and hold `region`; None if there are none."""
-    generated = generate(obj, robot, num, seed, region, phases, name=f"{obj.name} {region}")
-    assert generated.strict is not None
-    mask = generated.strict & generated.candidates.of_class(obj.classes[obj.label_index(region)])
-    return generated.candidates.select(mask) if mask.any() else None
-
-
-def ranked(
-    candidates: GraspCandidates, obj: AffordanceObject, robot: RobotDescription, phases: PhaseProgress, name: str
-) -> GraspCandidates:
-    """The candidates with their scores, best first."""
-    score = rank(candidates, obj, robot, progress=phases.phase(name, "lifts"))
-    order = torch.argsort(score, descending=True, stable=True)
-    return replace(candidates, score=score).select(order)
+def holds(
+    candidates: GraspCandidates,
+    obj: AffordanceObject,
+    robot: RobotDescription,
+    progress: Callable[[int, int], None] | None = None,
+    execution: Execution | None = None,
+    seed: int = 0,
+) -> Float[Tensor, " c"]:
+    """Share of validations passed with errors of the wrist's pose, drawn as `Execution` says, without a table."""
+    e, count = execution or Execution(), len(candidates)
+    draw = torch.Generator().manual_seed(seed)
+    rows = torch.arange(count).repeat(e.draws)
+    several = candidates.select(rows)
+    shift = e.position * (2 * torch.rand(len(rows), 3, generator=draw) - 1)
+    turn = e.rotation * (2 * torch.rand(len(rows), 3, generator=draw) - 1)
+    moved = replace(
+        several,
+        position=several.position + shift,
+        quaternion=quaternion_multiply(several.quaternion, quaternion_from_rotation_vector(turn)),
+    )
+    return validate(moved, obj, robot, progress=progress).passed.float().view(e.draws, count).mean(0)

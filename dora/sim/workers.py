@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 
 import torch
 
-Case, Result = TypeVar("Case"), TypeVar("Result")
+Case = TypeVar("Case")
+Result = TypeVar("Result")
 Progress = Callable[[int, int], None]
 """Called now and then with the number of cases done and of all cases."""
 
@@ -89,7 +90,7 @@ def _remember(factory: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
 
 def _work(cases: list[Any]) -> list[Any]:
     global _task
-    if _task is None:
-        assert _recipe is not None
-        _task = _recipe[0](*_recipe[1])
-    return [_task(case) for case in cases]
+    assert _recipe is not None
+    task = _task or _recipe[0](*_recipe[1])
+    _task = task
+    return [task(case) for case in cases]

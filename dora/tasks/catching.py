@@ -27,17 +27,17 @@ from dora.tasks.reference import Reference
 from dora.tasks.hammer_snapshot import HammerSnapshot
 from dora.tasks.stages import Stage
 
-LEAD = 0.10
+LEAD = 0.109
 """Time from the beginning of the catch until the fingers hold the handle [s]."""
 SINK = 0.10
 """How far the hand sinks in that time [m]."""
 FOLLOW_SPEED = 1.2
 """Speed up to which the closing hand sinks with the hammer [m/s]."""
-FOLLOW_TIME = 0.15
+FOLLOW_TIME = 0.155
 """How long it does so before it slows down [s]."""
 FOLLOW_UP, FOLLOW_DOWN = 30.0, 10.0
 """Acceleration and deceleration of that [m/s^2]."""
-FINGER_LAG = 0.025
+FINGER_LAG = 0.028
 """Time from the beginning of the sinking to the command to close [s]."""
 TRACK_TIME = 0.07
 """How long the closing hand goes on following the handle sideways [s]."""

@@ -217,12 +217,17 @@ PAPER_TERMS: Terms[HammerSnapshot] = Terms(
     }
 )
 
-# One power grasp around the handle, until the optimiser's candidates replace it: the hand's axes in the hammer frame,
-# the middle of the grip on the handle, and finger postures (proximal, medial of the four fingers and of the thumb).
-GRASPED = (-0.002817, 0.0, -0.115)
-"""Where the middle of the grip is on the handle [m]."""
-OPEN = (0.45, 0.45, 0.15, 0.15)
-CLOSED = (1.25, 0.95, 0.75, 0.60)
+# One power grasp around the handle, found by a cross-entropy search over catches, until the optimiser's candidates
+# replace it: where the hand holds the handle, the hand's axes in the hammer frame, and finger postures (proximal, medial
+# of the four fingers and of the thumb).
+HELD_AT = (-0.0028, 0.0, -0.102)
+"""Point of the handle's axis in the middle of the hand [m], hammer frame."""
+HELD_IN = (0.043, 0.0, 0.115)
+"""The same point in the hand frame [m]."""
+OPEN = (0.521, 0.537, 0.146, 0.237)
+CLOSED = (1.350, 1.025, 0.915, 0.747)
+"""[rad]"""
+THUMB_ABDUCTION = 0.119
 """[rad]"""
 HAND_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 """Rows of the rotation from the hand to the hammer: fingers along the strike, thumb towards the head."""
@@ -230,13 +235,14 @@ HAND_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 def _posture(fingers: tuple[float, float, float, float]) -> Tensor:
     proximal, medial, thumb_proximal, thumb_medial = fingers
-    return torch.tensor([0.0, thumb_proximal, thumb_medial, thumb_medial] + [0.0, proximal, medial, medial] * 4)[None]
+    thumb = [THUMB_ABDUCTION, thumb_proximal, thumb_medial, thumb_medial]
+    return torch.tensor(thumb + [0.0, proximal, medial, medial] * 4)[None]
 
 
 def hand_made_candidates() -> GraspCandidates:
     """One grasp with the palm on the handle's side, so that the fingers point in the direction of the strike."""
     axes = torch.tensor(HAND_AXES)
-    position = torch.tensor(GRASPED) - axes @ torch.tensor(GRIP)
+    position = torch.tensor(HELD_AT) - axes @ torch.tensor(HELD_IN)
     return GraspCandidates(
         "hammer", position[None], quaternion_from_matrix(axes)[None], axes[None, :, 0],
         _posture(OPEN), _posture(CLOSED), ("HandleGrasp",),

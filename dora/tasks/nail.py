@@ -26,7 +26,7 @@ TRAVEL = 0.025
 """How far the nail can sink [m]."""
 DRIVEN = 0.010
 """How far blows must drive it [m]."""
-STAND = 0.03
+STAND = 0.05
 """Height of the nail's head above the post before the first blow [m]."""
 HEAD_RADIUS = 0.010
 HEAD_HALF = 0.002
@@ -35,13 +35,13 @@ STOP_HALF = 0.010
 """Half thickness of the head for collisions [m]: a blow sinks several millimetres into a thin one and comes out below."""
 SHANK_RADIUS = 0.003
 """Radius of the nail, which is only drawn [m]."""
-POST_HALF = 0.04
+POST_HALF = 0.025
 """Half width of the post [m]."""
 MASS = 0.05
 """Mass of the nail [kg]."""
-RESISTANCE = 30.0
+RESISTANCE = 25.0
 """Constant force against the hammer [N]; a fifth more than the fingers hold steadily."""
-DRAG = 30.0
+DRAG = 40.0
 """Force per speed against the hammer [N s/m]."""
 DRIVE_LIMIT = 1e4
 """Largest force of the viscous drive [N]: none."""

@@ -48,8 +48,8 @@ def build() -> AffordanceObject:
         target="handle",
         weights=[(handle, BAR_MASS), (door, DOOR_MASS)],
         pieces=[
-            Piece("handle", capsule_between(*ends, BAR_RADIUS)),
-            *(Piece("handle", capsule_between(*foot, POST_RADIUS)) for foot in feet),
+            Piece("handle", capsule_between(ends[0], ends[1], BAR_RADIUS)),
+            *(Piece("handle", capsule_between(foot[0], foot[1], POST_RADIUS)) for foot in feet),
             Piece("door", Shape("box", (-x, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (x, y, z))),
         ],
         rest=ON_BACK,

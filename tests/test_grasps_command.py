@@ -1,0 +1,178 @@
+"""The grasp command: bad input, what it writes, interruption, and a mesh that nobody here made."""
+
+import importlib.util
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import mani_skill
+import pytest
+import torch
+
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.objects import load_object
+from dora.affordance.optimise import Settings
+from dora.affordance.shipped import shipped_path
+from dora.progress import PhaseProgress
+from dora.robot import load_robot
+from dora.sim import grasps
+from dora.sim.validation import Reason, Validation
+
+SCRIPT = Path(__file__).parent.parent / "experiments" / "grasps.py"
+ASSETS = Path(mani_skill.__file__).parent / "assets"
+KEYS = {
+    "object", "robot", "requested", "optimised", "valid", "valid_per_second", "optimise_seconds", "sim_success_rate",
+    "penetration_mm", "classes", "energy", "digest",
+}  # fmt: skip
+QUICK = Settings(iterations=20)
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("grasps_script", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["grasps_script"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def run(script: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["grasps.py", *arguments])
+    return script.main()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("", "--object or --mesh"),
+        ("--object jug --mesh a.stl", "--object or --mesh"),
+        ("--object jug --num 0", "--num is 0"),
+        ("--object jug --baselines -1", "--baselines -1"),
+        ("--object jug --region spoon", "no region 'spoon'"),
+        ("--object jug --scale 2", "belong to --mesh"),
+        ("--object jug --out a.json", "ends in .safetensors"),
+        ("--object jug --out /proc/nowhere/a.safetensors", "choose another --out"),
+        ("--object jug --robot ur5", "unknown robot 'ur5'"),
+        ("--mesh nowhere.stl", "nowhere.stl"),
+        ("--ship", "no object ''"),
+    ],
+)
+def test_bad_input(
+    script: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: str,
+    words: str,
+):
+    assert run(script, monkeypatch, *arguments.split()) == 2
+    captured = capsys.readouterr()
+    assert words in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+@pytest.mark.parametrize("arguments", ["--object spoon", "--validate isaac", "--no-such-option 1"])
+def test_errors_of_the_parser(script: ModuleType, monkeypatch: pytest.MonkeyPatch, arguments: str):
+    with pytest.raises(SystemExit) as exit_info:
+        run(script, monkeypatch, *arguments.split())
+    assert exit_info.value.code == 2
+
+
+def test_files_and_table(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    monkeypatch.setattr(grasps, "BASELINES", {name: QUICK for name in grasps.BASELINES})
+    monkeypatch.setattr(grasps, "Settings", lambda: QUICK)
+    out = tmp_path / "new" / "jug.safetensors"
+    arguments = ("--object", "jug", "--num", "6", "--baselines", "3", "--seed", "4", "--out", str(out))
+    assert run(script, monkeypatch, *arguments) == 0
+    shown = capsys.readouterr().out
+    assert shown.splitlines()[-1] == str(out)
+    assert "no closure" in shown
+    assert "one iteration" in shown
+    report = json.loads(out.with_suffix(".json").read_text())
+    candidates = GraspCandidates.load(out, load_object("jug"), load_robot("diana7_hit"))
+    assert KEYS <= set(report)
+    assert set(report["penetration_mm"]) >= {"median", "p95", "max"}
+    assert report["requested"] == 6
+    assert report["optimised"] == len(candidates)
+    assert report["region"] == "handle"
+    assert report["valid"] == int(candidates.valid.sum())
+    assert report["sim_success_rate"] is None
+    assert sum(report["classes"].values()) == report["valid"]
+    assert set(report["energy"]) == set(candidates.energy)
+    assert report["penetration_mm"]["max"] == pytest.approx(1000 * float(candidates.penetration.max()))
+    assert {name: b["requested"] for name, b in report["baselines"].items()} == {"no_closure": 3, "one_iteration": 3}
+    assert sorted(p.name for p in out.parent.iterdir()) == ["jug.json", "jug.safetensors"]
+
+
+def test_interruption_leaves_nothing(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(grasps, "optimise", stop)
+    out = tmp_path / "jug.safetensors"
+    assert run(script, monkeypatch, "--object", "jug", "--out", str(out)) == 130
+    assert "nothing was written" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_validity_is_that_of_the_simulation(monkeypatch: pytest.MonkeyPatch):
+    obj, robot = load_object("cube"), load_robot("diana7_hit")
+    seen = {}
+
+    def judge(candidates, obj, robot, protocol, progress) -> Validation:
+        progress(len(candidates), len(candidates))
+        seen["found"] = candidates
+        passed = torch.arange(len(candidates)) % 2
+        zeros = torch.zeros(len(candidates))
+        return Validation(
+            reason=torch.where(passed == 1, int(Reason.PASSED), int(Reason.SLIPPED)),
+            displacement=zeros, closing_shift=zeros + 0.03 * (torch.arange(len(candidates)) == 1), penetration=zeros,
+            part_force=torch.zeros(len(candidates), 6), label_force=torch.zeros(len(candidates), 1),
+            candidate_penetration=zeros + 0.003 * (torch.arange(len(candidates)) == 3),
+            self_penetration=zeros, protocol=protocol,
+        )  # fmt: skip
+
+    monkeypatch.setattr(grasps, "validate", judge)
+    generated = grasps.generate(obj, robot, 6, 0, None, PhaseProgress(), True, QUICK)
+    report = grasps.summary(generated)
+    assert generated.candidates.valid.tolist() == [False, True, False, False, False, True]
+    assert report["valid"] == 2
+    assert report["sim_success_rate"] == pytest.approx(0.5)
+    assert report["valid_share"] == pytest.approx(2 / 6)
+    assert report["strict_share"] == pytest.approx(1 / 6)
+    seconds = generated.optimise_seconds + generated.validate_seconds
+    assert report["valid_per_second"] == pytest.approx(2 / seconds)
+
+
+def test_the_digest_follows_object_robot_and_settings():
+    path = shipped_path("cube")
+    candidates = GraspCandidates.load(path)
+    digest = grasps.origin_digest(candidates)
+    assert grasps.origin_digest(GraspCandidates.load(path)) == digest
+    for name in ("digest", "robot_digest", "settings"):
+        assert grasps.origin_digest(replace(candidates, **{name: "other"})) != digest
+
+
+def test_a_mesh_from_elsewhere_goes_all_the_way(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    """A bottle modelled by others (18 cm at this scale): import, search, simulation, files."""
+    monkeypatch.setenv("DORA_CACHE", str(tmp_path / "cache"))
+    bottle = ASSETS / "deformable_manipulation" / "bottle.glb"
+    out = tmp_path / "bottle.safetensors"
+    options = ("--mesh", str(bottle), "--scale", "0.03", "--num", "8", "--baselines", "0", "--validate", "sapien")
+    assert run(script, monkeypatch, *options, "--out", str(out)) == 0
+    report = json.loads(out.with_suffix(".json").read_text())
+    candidates = GraspCandidates.load(out)
+    assert candidates.object == "bottle"
+    assert report["region"] is None
+    assert report["valid"] == int(candidates.valid.sum()) >= 1
+    assert 0 < report["sim_success_rate"] <= 1

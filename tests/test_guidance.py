@@ -1,0 +1,206 @@
+"""Guidance part by part: which candidates are chosen, how actions correct, what noise and pushes do."""
+
+import pytest
+import torch
+from invented import invented
+
+import dora.tasks as tasks
+from dora.affordance.candidates import GraspCandidates
+from dora.errors import InputError
+from dora.tasks.choice import NEAREST, Choice
+from dora.tasks.correction import SMOOTHING, Bounds, Correction, Target
+from dora.tasks.disturbances import SENSOR_DRAWS, Disturbances, uniform
+from dora.tasks.options import PARTS
+from dora.tasks.presets import PRESETS, Preset
+
+CPU = torch.device("cpu")
+IDENTITY = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+
+
+def along_x(*x: float, score: tuple[float, ...] | None = None) -> GraspCandidates:
+    """Candidates at places along x [m]."""
+    n = len(x)
+    position = torch.zeros(n, 3)
+    position[:, 0] = torch.tensor(x)
+    hand = torch.zeros(n, 20)
+    scores = {} if score is None else {"score": torch.tensor(score)}
+    return GraspCandidates(
+        "thing", position, IDENTITY.repeat(n, 1), torch.tensor([[0.0, 0, -1]]).repeat(n, 1), hand, hand + 1,
+        ("Grasp",) * n, **scores,
+    )  # fmt: skip
+
+
+def nearest(candidates: GraspCandidates, reachable: list[bool], wrist_x: float = 0.0) -> list[int]:
+    choice, zero = Choice(candidates, 1, CPU), torch.zeros(1, 3)
+    wrist = torch.tensor([[wrist_x, 0.0, 0.0]])
+    return choice.nearest(zero, IDENTITY, wrist, IDENTITY, torch.tensor([reachable])).tolist()[0]
+
+
+def test_the_nearest_reachable_candidates_are_chosen():
+    four = along_x(0.1, 0.2, 0.3, 0.4)
+    assert nearest(four, [True] * 4) == [0, 1, 2]
+    assert nearest(four, [True] * 4, wrist_x=0.38) == [3, 2, 1]
+    assert nearest(four, [False, True, False, True]) == [1, 3, 1]  # the first is repeated
+    assert nearest(along_x(0.1, 0.2), [True, True], wrist_x=1.0) == [1, 0, 1]
+
+
+def test_well_ranked_candidates_come_first():
+    ranked = along_x(0.1, 0.2, 0.3, 0.4, score=(0.3, 0.9, 0.95, 1.0))
+    assert nearest(ranked, [True] * 4) == [1, 2, 3]
+    assert nearest(ranked, [True, False, False, False]) == [0, 0, 0]
+
+
+def test_candidate_errors_are_bounded_and_follow_the_share():
+    candidates, preset = along_x(0.1, 0.2, 0.3), PRESETS["hard"]
+    n = 500
+    choice = Choice(candidates, n, CPU)
+    error = 2 * torch.rand(n, 26, generator=torch.Generator().manual_seed(0)) - 1
+    index = torch.arange(3).repeat(n, 1)
+    rows, able = torch.arange(n), torch.ones(n, dtype=torch.bool)
+    choice.choose(rows, index, able, error, preset)
+    off = choice.buffers["position"] - candidates.position
+    assert off.abs().max() <= preset.candidate_position
+    assert off.std(0).min() > 0.4 * preset.candidate_position
+    assert torch.equal(off[:, 0] + candidates.position[1], off[:, 1] + candidates.position[1]) or (
+        (off[:, 0] - off[:, 1]).abs().max() < 1e-6
+    )  # one error for all candidates of an environment
+    choice.error_scale = 0.5
+    choice.choose(rows, index, able, error, preset)
+    half = choice.buffers["position"] - candidates.position
+    torch.testing.assert_close(half, off / 2, atol=1e-6, rtol=0)
+
+
+def test_corrections_are_low_passed_bounded_and_in_the_hand_frame():
+    bounds = Bounds(position=0.02, rotation=0.1, joint=0.2)
+    correction = Correction(1, 26, bounds, CPU)
+    quarter = torch.tensor([[0.5**0.5, 0.0, 0.0, 0.5**0.5]])  # hand x is world y
+    target = Target(torch.zeros(1, 3), quarter, torch.zeros(1, 20))
+    action = torch.zeros(1, 26)
+    action[0, 0], action[0, 6:] = 1.0, -1.0
+    first = correction.apply(target, action, lambda hand: hand)
+    torch.testing.assert_close(first.wrist_p, torch.tensor([[0.0, SMOOTHING * 0.02, 0.0]]), atol=1e-7, rtol=0)
+    for _ in range(60):
+        last = correction.apply(target, action, lambda hand: hand)
+    torch.testing.assert_close(last.wrist_p, torch.tensor([[0.0, 0.02, 0.0]]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(last.hand, torch.full((1, 20), -0.2), atol=1e-6, rtol=0)
+    correction.set_scale(0.5)
+    halved = correction.apply(target, action, lambda hand: hand)
+    torch.testing.assert_close(halved.wrist_p, torch.tensor([[0.0, 0.01, 0.0]]), atol=1e-6, rtol=0)
+    with pytest.raises(InputError, match="between 0 and 1"):
+        correction.set_scale(1.5)
+
+
+def test_noise_is_a_function_of_key_and_step_and_looks_uniform():
+    keys = torch.arange(200)
+    a = uniform(keys, torch.full((200,), 3), 26)
+    assert torch.equal(a, uniform(keys, torch.full((200,), 3), 26))
+    assert not torch.equal(a, uniform(keys, torch.full((200,), 4), 26))
+    assert torch.equal(uniform(keys[7:8], torch.tensor([3]), 26)[0], a[7])  # whatever the others do
+    assert 0 <= a.min() and a.max() < 1
+    assert abs(a.mean() - 0.5) < 0.02 and abs(a.std() - 12**-0.5) < 0.02
+    both = torch.stack([a.flatten()[:-1], a.flatten()[1:]])
+    assert torch.corrcoef(both)[0, 1].abs() < 0.05
+    steps = torch.stack([uniform(keys[:1], torch.tensor([k]), 4)[0] for k in range(500)])
+    assert torch.corrcoef(torch.cat([steps[:-1], steps[1:]], 1).T)[:4, 4:].abs().max() < 0.2
+
+
+def test_what_is_seen_is_noisy_within_the_preset_and_the_truth_is_kept():
+    preset, n = PRESETS["standard"], 300
+    noise = Disturbances(preset, n, 26, 20, CPU)
+    noise.begin(torch.arange(n), torch.rand(n, generator=torch.Generator().manual_seed(0)))
+    choice = Choice(along_x(0.1), n, CPU)
+    s = invented(n)
+    seen = noise.seen(s, choice, torch.zeros(n, dtype=torch.long))
+    assert seen.object_p.abs().max() <= preset.seen_position
+    assert seen.object_p.std() > 0.4 * preset.seen_position
+    assert 0 < seen.hand_q.abs().max() <= preset.seen_joint
+    assert torch.equal(s.object_p, torch.zeros(n, 3)) and torch.equal(s.hand_q, torch.zeros(n, 20))
+    torch.testing.assert_close(seen.goal_p, choice.goals(seen.object_p, seen.object_q)[0][:, 0])
+    assert torch.equal(seen.touch, s.touch)
+    clear = Disturbances(PRESETS["none"], n, 26, 20, CPU)
+    assert clear.seen(s, choice, torch.zeros(n, dtype=torch.long)) is s
+
+
+def test_delayed_actions_take_effect_later_and_the_first_at_once():
+    late = Disturbances(Preset(name="late", delay=2), 1, 1, 20, CPU)
+    done = [late.delayed(torch.tensor([[float(k)]]), torch.tensor([k])).item() for k in range(6)]
+    assert done == [0.0, 0.0, 0.0, 1.0, 2.0, 3.0]
+
+
+def test_pushes_come_at_their_rate_with_their_impulse_in_all_directions():
+    preset, n, steps = PRESETS["hard"], 100, 200
+    pushes = Disturbances(preset, n, 26, 20, CPU)
+    pushes.begin(torch.arange(n), torch.rand(n, generator=torch.Generator().manual_seed(1)))
+    all_steps = torch.stack([pushes.pushes(torch.full((n,), k)) for k in range(steps)]).flatten(0, 1)
+    hit = all_steps.norm(dim=-1) > 0
+    assert hit.sum() / (n * steps / 20) == pytest.approx(preset.push_rate, rel=0.2)
+    torch.testing.assert_close(all_steps[hit].norm(dim=-1), torch.full((int(hit.sum()),), preset.push))
+    assert all_steps[hit].mean(0).norm() < 0.2 * preset.push
+    assert SENSOR_DRAWS == 26
+
+
+def test_a_push_moves_the_object_by_impulse_over_mass():
+    task = tasks.make_task("DoraCube-v1", 2, preset="none")
+    task.reset(seed=0)
+    start = task.snapshot.object_p.clone()
+    task._push(torch.tensor([[0.06, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    task.step(torch.zeros(2, task.action_size))
+    moved = task.snapshot.object_p - start
+    assert moved[0, 0] > 0.005
+    assert moved[1].norm() < 1e-3
+    task.close()
+
+
+@pytest.mark.parametrize("missing", PARTS)
+def test_each_part_of_guidance_can_be_left_out(missing: str):
+    whole = tasks.make_task("DoraCube-v1", 2)
+    task = tasks.make_task("DoraCube-v1", 2, guidance_parts=tuple(p for p in PARTS if p != missing))
+    gone = set(whole.observation_entries) - set(task.observation_entries)
+    expected = {
+        "observation": {"goal", "goal_hand", "near", "surface"},
+        "prior": {"phase", "correction"},
+    }
+    assert gone == expected.get(missing, set())
+    lost = set(whole._terms.terms) - set(task._terms.terms)
+    assert lost == ({"affordance", "candidate"} if missing == "reward" else set())
+    assert task.corrects == (missing != "prior")
+    assert ("unreachable" in task.logged) == (missing != "filter")
+    a, b = whole.reset(seed=3), task.reset(seed=3)
+    torch.testing.assert_close(whole.snapshot.object_p, task.snapshot.object_p, atol=0, rtol=0)
+    assert len(a[0]) == len(b[0])
+    whole.close()
+    task.close()
+
+
+@pytest.mark.parametrize(
+    "options", [{"guidance_parts": ("magic",)}, {"guidance": "none", "guidance_parts": ("prior",)}]
+)
+def test_bad_parts_are_refused(options: dict):
+    with pytest.raises(InputError, match="part"):
+        tasks.make_task("DoraCube-v1", 1, **options)
+
+
+@pytest.mark.parametrize("parts", [None, ("observation", "reward", "prior")])
+def test_a_start_without_a_reachable_candidate_fails_and_earns_nothing(parts: tuple[str, ...] | None):
+    task = tasks.make_task("DoraCube-v1", 3, guidance_parts=parts)
+    able = torch.tensor([[True], [False], [True]])
+    task.reachable = lambda p, q: able[: len(p)].expand(-1, 4)  # type: ignore[method-assign]
+    task.reset(seed=0)
+    _, reward, terminated, _, info = task.step(torch.zeros(3, task.action_size))
+    filtered = parts is None
+    assert info["unreachable"].tolist() == [False, filtered, False]
+    assert terminated.tolist() == [False, filtered, False]
+    assert (reward == 0).tolist() == [False, filtered, False]
+    assert (reward[[0, 2]] > 0).all()
+    task.close()
+
+
+def test_annealed_shares_survive_a_reset():
+    task = tasks.make_task("DoraCube-v1", 2)
+    task.reset(seed=0)
+    task.anneal(bounds=0.25, error=0.5)
+    task.reset(seed=1)
+    assert (task.guide.correction.scale, task.guide.choice.error_scale) == (0.25, 0.5)
+    with pytest.raises(InputError):
+        task.anneal(error=2.0)
+    task.close()

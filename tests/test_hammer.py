@@ -1,0 +1,335 @@
+"""DoraHammer-v1: ballistics and striking geometry on invented states, the nail, and what the scripted solution does."""
+
+from collections.abc import Iterator
+from dataclasses import fields
+from math import pi
+
+import numpy as np
+import pytest
+import sapien
+import torch
+from mani_skill.utils.structs import Pose
+from torch import Tensor
+
+import dora.tasks as tasks
+from dora.robot.rotations import quaternion_apply, quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
+from dora.sim.substeps import watch_physics
+from dora.tasks import hammer
+from dora.tasks.catching import ALIGN, PHASES, CatchReference
+from dora.tasks.hammer_snapshot import HammerSnapshot, face_to_nail, handle_distance, misalignment
+from dora.tasks.hammering import Strike, arrival, blend, compose, fall_time, fallen, inverse, relative, slew, slid
+from dora.tasks.nail import BLOW_SPEED, TRAVEL
+
+FACE = (0.04, 0.0, 0.04)
+SIZES = {
+    "arm_q": 7, "hand_q": 20, "hand_v": 20, "hand_target": 20, "wrist_q": 4, "object_q": 4, "goal_q": 4,
+    "touch": 6, "force": 6, "action": 26, "previous_action": 26, "correction": 26,
+    "goal_pregrasp": 20, "goal_grasp": 20, "phase": len(PHASES), "contact_finger": 0,
+}  # fmt: skip
+SCALARS = ("supported", "penetration", "deepest", "stage", "time", "nail_depth", "nail_driven", "drift_p", "drift_r")
+FLAT = quaternion_multiply(
+    quaternion_from_rotation_vector(torch.tensor([0.0, pi / 2, 0.0])), torch.tensor([1.0, 0.0, 0.0, 0.0])
+)
+"""Handle along +x, face down."""
+
+
+def invented(n: int, **given: Tensor) -> HammerSnapshot:
+    """A snapshot of zeros and unit quaternions, with what is given."""
+    values: dict[str, Tensor] = {}
+    for f in fields(HammerSnapshot):
+        shape = (n,) if f.name in SCALARS else (n, SIZES.get(f.name, 3))
+        values[f.name] = torch.zeros(shape)
+        if f.name.endswith("_q") and SIZES.get(f.name) == 4:
+            values[f.name][:, 0] = 1.0
+    values |= {"tip_p": torch.zeros(n, 5, 3), "tip_q": torch.tensor([1.0, 0, 0, 0]).repeat(n, 5, 1)}
+    values |= {"near_p": torch.zeros(n, 3, 3), "near_q": values["tip_q"][:, :3], "contact_p": torch.zeros(n, 0, 3)}
+    values |= {k: values[k].bool() for k in ("touch", "supported")}
+    values |= {k: values[k].long() for k in ("stage", "contact_finger")}
+    values |= {
+        "face": torch.tensor(FACE).repeat(n, 1),
+        "butt": torch.tensor([0.0, 0.0, -0.22]).repeat(n, 1),
+        "neck": torch.tensor([0.0, 0.0, 0.04]).repeat(n, 1),
+    }
+    return HammerSnapshot(**(values | given))
+
+
+def random_pose(n: int) -> tuple[Tensor, Tensor]:
+    return torch.randn(n, 3), quaternion_from_rotation_vector(torch.randn(n, 3))
+
+
+# ---------------------------------------------------------------------- geometry
+
+
+def test_a_fall_takes_as_long_as_it_takes():
+    time = fall_time(torch.tensor([0.0, 1.0, 0.2, -1.0]), torch.tensor([0.0, 0.0, 1.0, 0.0]))
+    torch.testing.assert_close(time[1], torch.tensor((2 / 9.81) ** 0.5))
+    assert time[0] == 0
+    t = time[2]
+    assert abs(0.2 + t - 9.81 * t**2 / 2) < 1e-5
+    assert time[3] == 0
+
+
+def test_the_predicted_point_is_at_the_height_at_the_time_of_arrival():
+    torch.manual_seed(0)
+    n = 64
+    body = torch.rand(n, 3) + torch.tensor([0.0, 0.0, 1.0]), quaternion_from_rotation_vector(0.2 * torch.randn(n, 3))
+    velocity, spin = 0.5 * torch.randn(n, 3), 0.5 * torch.randn(n, 3)
+    point, height = 0.1 * torch.randn(n, 3), torch.full((n,), 0.3)
+    time = arrival(body, velocity, spin, point, height)
+    position, quaternion = fallen(body, velocity, spin, time)
+    z = (position + quaternion_apply(quaternion, point))[:, 2]
+    torch.testing.assert_close(z, height, atol=2e-3, rtol=0)
+
+
+def test_poses_compose_and_invert():
+    torch.manual_seed(0)
+    a, b = random_pose(32), random_pose(32)
+    again = compose(a, relative(a, b))
+    torch.testing.assert_close(again[0], b[0], atol=1e-5, rtol=0)
+    assert rotation_angle(again[1], b[1]).max() < 1e-3
+    none = compose(a, inverse(a))
+    assert none[0].abs().max() < 1e-5
+
+
+def test_a_slid_pose_is_at_the_height_and_on_the_axis():
+    axis = torch.tensor([[0.3, 0.0, 0.954]])
+    goal = torch.tensor([[0.1, 0.2, 0.9]]), torch.tensor([[1.0, 0, 0, 0]])
+    moved, _ = slid(goal, axis, torch.tensor([0.6]))
+    assert abs(moved[0, 2] - 0.6) < 1e-6
+    assert torch.linalg.cross(moved - goal[0], axis).norm() < 1e-6
+
+
+def test_slewing_is_bounded_and_arrives():
+    torch.manual_seed(0)
+    here, goal = random_pose(16), random_pose(16)
+    for _ in range(400):
+        new = slew(here, goal, 0.01, 0.05)
+        assert ((new[0] - here[0]).norm(dim=-1) <= 0.0101).all()
+        assert (rotation_angle(new[1], here[1]) <= 0.051).all()
+        here = new
+    torch.testing.assert_close(here[0], goal[0], atol=1e-4, rtol=0)
+    assert rotation_angle(here[1], goal[1]).max() < 2e-3
+
+
+def test_blending_halfway_is_the_middle_for_either_sign():
+    a = torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]])
+    b = torch.ones(1, 3), -quaternion_from_rotation_vector(torch.tensor([[0.0, 0.0, 0.4]]))
+    p, q = blend(a, b, 0.5)
+    torch.testing.assert_close(p, torch.full((1, 3), 0.5))
+    assert abs(rotation_angle(q, a[1]) - 0.2) < 1e-3
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+def test_a_blow_meets_the_nail_squarely(yaw: float):
+    top, face = torch.tensor([0.6, -0.1, 0.3]), torch.tensor([FACE, FACE])
+    strike = Strike(top, face, 0.36, yaw)
+    depth = torch.tensor([0.0, 0.01])
+    nail_p = top.repeat(2, 1) - torch.stack([0 * depth, 0 * depth, depth], -1)
+    p, q = strike.hammer(depth, torch.zeros(2), 0.0)
+    s = invented(2, object_p=p, object_q=q, nail_p=nail_p)
+    assert face_to_nail(s).abs().max() < 1e-6
+    assert misalignment(s).max() < 1e-3
+    raised_p, raised_q = strike.hammer(depth, torch.full((2,), 0.5), 0.0)
+    up = invented(2, object_p=raised_p, object_q=raised_q, nail_p=nail_p)
+    torch.testing.assert_close(misalignment(up), torch.full((2,), 0.5), atol=1e-4, rtol=0)
+    assert (face_to_nail(up)[:, 2] < -0.1).all()  # above the nail
+
+
+def test_distance_from_the_handle():
+    points = torch.tensor([[[0.03, 0.0, 0.0], [0.0, 0.0, -0.25], [0.0, 0.04, 0.07]]])
+    torch.testing.assert_close(handle_distance(invented(1), points), torch.tensor([[0.03, 0.03, 0.05]]))
+
+
+# ------------------------------------------------------------------------ stages
+
+
+def caught(n: int, **given: Tensor) -> HammerSnapshot:
+    """Hammers at the middle of the grip, two fingers on them."""
+    touch = torch.zeros(n, 6, dtype=torch.bool)
+    touch[:, 1:3] = True
+    grip = torch.tensor(hammer.GRIP).repeat(n, 1)
+    return invented(n, **({"object_p": grip, "touch": touch} | given))
+
+
+def test_catching_needs_place_fingers_and_rest():
+    done = hammer.STAGES[0].done
+    assert done(caught(1)).all()
+    assert not done(caught(1, touch=torch.zeros(1, 6, dtype=torch.bool))).any()
+    assert not done(caught(1, object_v=torch.tensor([[0.0, 0.0, -0.6]]))).any()
+    assert not done(caught(1, object_p=torch.tensor([[0.045, 0.0, 0.30]]))).any()
+    # what moves along with the hand rests in it
+    moving = torch.tensor([[0.0, 1.0, 0.0]])
+    assert done(caught(1, object_v=moving, wrist_v=moving)).all()
+
+
+def test_stillness_counts_over_the_window_only():
+    done = hammer.STAGES[1].done
+    assert done(caught(1)).all()
+    assert not done(caught(1, drift_p=torch.tensor([0.009]))).any()
+    assert not done(caught(1, drift_r=torch.tensor([0.2]))).any()
+    assert not done(caught(1, drift_p=torch.tensor([hammer.UNKNOWN]))).any()
+
+
+def test_orientation_is_judged_between_striking_axis_and_nail_axis():
+    done = hammer.STAGES[2].done
+    n = 4
+    tilt = torch.tensor([0.0, 0.2, 0.3, 0.0])
+    q = quaternion_multiply(
+        quaternion_from_rotation_vector(torch.stack([tilt, 0 * tilt, 0 * tilt], -1)), FLAT.expand(n, 4)
+    )
+    p = torch.tensor(hammer.GRIP).repeat(n, 1)
+    nail_p = p + quaternion_apply(q, torch.tensor(FACE).repeat(n, 1)) - torch.tensor([0.0, 0.0, 0.05])
+    nail_p[3, 0] += 0.02
+    s = caught(n, object_p=p, object_q=q, nail_p=nail_p)
+    assert done(s).tolist() == [True, True, False, False]
+
+
+def test_depth_pays_until_the_target_and_only_if_driven():
+    depth = torch.tensor([0.0, 0.005, 0.010, 0.020])
+    driven = hammer.TERMS.terms["strike"].value(invented(4, nail_driven=depth, nail_depth=depth))
+    torch.testing.assert_close(driven, torch.tensor([0.0, 0.5, 1.0, 1.0]))
+    pushed = hammer.TERMS.terms["strike"].value(invented(4, nail_depth=depth))
+    assert (pushed == 0).all()
+
+
+def test_every_term_stays_in_bounds_on_random_states():
+    torch.manual_seed(0)
+    n = 256
+    s = invented(
+        n,
+        tip_p=torch.randn(n, 5, 3), object_p=torch.randn(n, 3), wrist_p=torch.randn(n, 3), goal_p=torch.randn(n, 3),
+        object_q=random_pose(n)[1], nail_p=torch.randn(n, 3), nail_driven=0.05 * torch.rand(n),
+        touch=torch.rand(n, 6) > 0.5, action=3 * torch.randn(n, 26), penetration=torch.rand(n) * 0.05,
+        drift_p=torch.rand(n), drift_r=torch.rand(n), stage=torch.randint(0, 5, (n,)),
+    )  # fmt: skip
+    for terms in (hammer.TERMS, hammer.PAPER_TERMS):
+        for name, term in terms.terms.items():
+            value = term.value(s)
+            assert ((value >= 0) & (value <= 1)).all(), name
+
+
+# --------------------------------------------------------------------- reference
+
+
+def test_the_reference_brings_the_held_hammer_over_the_nail_wherever_it_is_held():
+    torch.manual_seed(0)
+    n = 8
+    top, face = torch.tensor(hammer.NAIL_TOP), torch.tensor(FACE).repeat(n, 1)
+    reference = CatchReference(n, Strike(top, face, hammer.SWING_RADIUS), 0.025, torch.device("cpu"))
+    held = 0.1 * torch.randn(n, 3), quaternion_from_rotation_vector(0.5 * torch.randn(n, 3))
+    reference.begin(torch.arange(n), torch.zeros(n, 3), torch.tensor([1.0, 0, 0, 0]).repeat(n, 1))
+    reference.phase.index.fill_(ALIGN)
+    wrist = torch.zeros(n, 3), torch.tensor([1.0, 0, 0, 0]).repeat(n, 1)
+    nail_p = top.repeat(n, 1)
+    for _ in range(120):
+        p, q = compose(wrist, held)
+        s = invented(n, wrist_p=wrist[0], wrist_q=wrist[1], object_p=p, object_q=q, nail_p=nail_p)
+        reference.advance(s)
+        reference.phase.index.fill_(ALIGN)
+        target = reference.target(s)
+        wrist = target.wrist_p, target.wrist_q
+    p, q = compose(wrist, held)
+    s = invented(n, object_p=p, object_q=q, nail_p=nail_p)
+    assert misalignment(s).max() < 0.02
+    assert face_to_nail(s)[:, :2].norm(dim=-1).max() < 0.005
+    assert ((face_to_nail(s)[:, 2] < -0.03) & (face_to_nail(s)[:, 2] > -0.07)).all()
+
+
+# -------------------------------------------------------------------------- nail
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[hammer.HammerEnv]:
+    """One environment whose hammer the tests drop on the nail by hand."""
+    task = tasks.make_task("DoraHammer-v1", 1, preset="none", sim_backend="physx_cpu", guidance="none")
+    assert isinstance(task, hammer.HammerEnv)
+    yield task
+    task.close()
+
+
+def over_nail(task: hammer.HammerEnv, gap: float, speed: float) -> sapien.physx.PhysxRigidDynamicComponent:
+    """Puts the hammer face down over the nail, `gap` [m] above it and moving down."""
+    task.reset(seed=0)
+    strike = Strike(torch.tensor(hammer.NAIL_TOP), task._points["face"], hammer.SWING_RADIUS)
+    task.target_object.set_pose(Pose.create_from_pq(*strike.hammer(torch.zeros(1), torch.zeros(1), gap)))
+    task.target_object.set_linear_velocity(torch.tensor([[0.0, 0.0, -speed]]))
+    task.target_object.set_angular_velocity(torch.zeros(1, 3))
+    return task.target_object._bodies[0]
+
+
+def run(task: hammer.HammerEnv, steps: int) -> tuple[float, float]:
+    """Depth and driven depth after some control steps with the arm at rest [mm]."""
+    for _ in range(steps):
+        task.step(task.scripted_action() * 0)
+    return 1000 * task.nail.depth.item(), 1000 * task.nail.driven.item()
+
+
+def test_a_blow_drives_the_nail_and_a_harder_one_drives_it_further(bench: hammer.HammerEnv):
+    soft, hard = [], []
+    for speed, result in ((1.0, soft), (1.6, hard)):
+        over_nail(bench, 0.01, speed)
+        result += run(bench, 4)
+    print(f"1.0 m/s: {soft[1]:.2f} mm, 1.6 m/s: {hard[1]:.2f} mm")
+    assert 0.5 < soft[1] < hard[1] < 8
+    assert 2 < hard[1]
+    assert hard[1] == pytest.approx(hard[0], abs=1e-3)
+
+
+def test_leaning_and_pushing_do_not_count(bench: hammer.HammerEnv):
+    body = over_nail(bench, 0.0005, 0.0)
+    push = [0.0]
+
+    def lean(_: int) -> None:
+        body.add_force_at_point(np.array([0.0, 0.0, -push[0]]), body.entity_pose.p)
+
+    watch_physics(bench.scene, lean)
+    push[0] = 20.0
+    depth, driven = run(bench, 4)
+    assert depth < 0.5
+    assert driven == 0.0
+    push[0] = 80.0
+    over_nail(bench, 0.0005, 0.0)
+    body = bench.target_object._bodies[0]
+    watch_physics(bench.scene, lean)
+    depth, driven = run(bench, 6)
+    assert depth > 5  # it yields to a strong push
+    assert driven == 0.0
+    bench.reset(seed=0)
+
+
+def test_slow_impacts_and_no_contact_leave_it_alone(bench: hammer.HammerEnv):
+    over_nail(bench, 0.004, 0.8 * BLOW_SPEED)
+    _, driven = run(bench, 2)
+    assert driven == 0.0
+    bench.reset(seed=1)
+    assert run(bench, 8) == (0.0, 0.0)
+
+
+def test_the_nail_never_comes_back_up_and_a_restored_one_stays_where_it_was(bench: hammer.HammerEnv):
+    over_nail(bench, 0.01, 1.6)
+    depth, driven = run(bench, 4)
+    joint = bench.nail.articulation.get_qpos().item() * 1000
+    assert joint == pytest.approx(depth, abs=0.05)
+    state = bench.get_state_dict()
+    bench.reset(seed=3)
+    assert bench.nail.depth.item() == 0.0
+    bench.set_state_dict(state)
+    assert run(bench, 2)[1] == pytest.approx(driven, abs=1e-3)
+    assert bench.nail.articulation.get_qpos().item() * 1000 == pytest.approx(depth, abs=0.05)
+    assert depth < 1000 * TRAVEL
+
+
+# ---------------------------------------------------------------------- solution
+
+
+def test_the_script_catches_strikes_and_stays_clean():
+    starts = 100
+    task = tasks.make_task("DoraHammer-v1", starts, preset="none")
+    task.reset(seed=0)
+    zero = torch.zeros(starts, task.action_size)
+    for _ in range(task.max_steps):
+        info = task.step(zero)[-1]
+    rates = {k: v.float().mean().item() for k, v in info.items() if k.startswith("stage/")}
+    print(rates, f"success {info['success'].float().mean():.2f}, deepest {info['penetration_max_mm'].max():.1f} mm")
+    assert info["success"].float().mean() >= 0.8
+    task.close()

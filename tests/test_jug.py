@@ -1,0 +1,148 @@
+"""DoraJug-v1: its logic on invented states, and what its scripted grasp is worth."""
+
+from math import cos, pi, radians, sin
+
+import pytest
+import torch
+from invented import invented
+from torch import Tensor
+
+import dora.tasks as tasks
+from dora.affordance.objects import load_object
+from dora.tasks import jug
+from dora.tasks.snapshot import CONTACT_CLASSES, Snapshot
+
+STARTS = 100
+"""Random starts of the scripted grasp."""
+THUMB, INDEX = CONTACT_CLASSES.index("thumb"), CONTACT_CLASSES.index("index")
+
+
+def jugs(n: int, **given: Tensor) -> Snapshot:
+    """Invented jugs of nominal size."""
+    half = torch.as_tensor(load_object("jug").mesh.extents / 2, dtype=torch.float32)
+    return invented(n, object_half=half.repeat(n, 1), **given)
+
+
+def tilted(angle: float) -> Tensor:
+    return torch.tensor([[cos(angle / 2), sin(angle / 2), 0.0, 0.0]])
+
+
+def touching(*labels: str) -> Snapshot:
+    """Thumb, index and so on, each in contact with the named region."""
+    regions = jug.jug_map()
+    where = [regions.points[regions.labels == regions.label_index(label)][7] for label in labels]
+    finger = torch.arange(THUMB, THUMB + len(labels))
+    return jugs(1, contact_p=torch.stack(where)[None], contact_finger=finger[None])
+
+
+@pytest.mark.parametrize(
+    ("labels", "by_handle"),
+    [
+        (("handle", "handle", "handle"), True),
+        (("body", "body", "body"), False),
+        (("handle", "body"), True),  # the thumb counts twice
+        (("body", "handle"), False),
+        (("rim", "rim", "handle"), False),
+    ],
+)
+def test_the_class_is_voted_by_the_actual_contacts(labels: tuple[str, ...], by_handle: bool):
+    assert bool(jug.by_the_handle(touching(*labels))) == by_handle
+
+
+def test_without_contact_there_is_no_class():
+    nothing = jugs(1, contact_p=torch.zeros(1, 3, 3), contact_finger=torch.zeros(1, 3, dtype=torch.long))
+    assert jug.grasp_label(nothing).item() == -1
+    assert not jug.by_the_handle(nothing)
+
+
+def test_distances_are_those_of_the_handle_and_follow_the_jug():
+    regions = jug.jug_map()
+    handle = regions.labels == regions.label_index("handle")
+    point, normal = regions.points[handle][::60][:5], regions.normals[handle][::60][:5]
+    tips = point + 0.02 * normal
+    turn = torch.tensor([[cos(0.6), 0.0, 0.0, sin(0.6)]])
+    matrix = torch.tensor([[cos(1.2), -sin(1.2), 0], [sin(1.2), cos(1.2), 0], [0, 0, 1]])
+    moved = tips @ matrix.T + torch.tensor([0.5, 0.1, 0.1])
+    s = jugs(1, tip_p=moved[None], object_p=torch.tensor([[0.5, 0.1, 0.1]]), object_q=turn)
+    expected = regions.region_distance(tips, "handle") - jug.TIP_RADIUS
+    torch.testing.assert_close(jug.handle_distance(s)[0], expected, atol=1e-4, rtol=0)
+    assert (expected <= 0.0101).all()
+
+
+@pytest.mark.parametrize(("angle", "level"), [(0.0, True), (25.0, True), (35.0, False), (90.0, False)])
+def test_only_an_upright_jug_is_held(angle: float, level: bool):
+    touch = torch.zeros(1, 6, dtype=torch.bool)
+    touch[0, :2] = True
+    s = jugs(1, object_p=torch.tensor([[0.0, 0.0, 0.12]]), object_q=tilted(radians(angle)), touch=touch)
+    assert bool(jug.held(s)) == level
+
+
+def test_every_term_stays_in_bounds_on_random_states():
+    torch.manual_seed(0)
+    n = 256
+    s = jugs(
+        n,
+        tip_p=torch.randn(n, 5, 3), object_p=torch.randn(n, 3), wrist_p=torch.randn(n, 3), goal_p=torch.randn(n, 3),
+        object_q=torch.nn.functional.normalize(torch.randn(n, 4), dim=-1),
+        touch=torch.rand(n, 6) > 0.5, action=3 * torch.randn(n, 26), penetration=torch.rand(n) * 0.05,
+        stage=torch.randint(0, 4, (n,)), contact_p=0.1 * torch.randn(n, 4, 3),
+        contact_finger=torch.randint(0, 7, (n, 4)),
+    )  # fmt: skip
+    for terms in (jug.TERMS, jug.PAPER_TERMS):
+        for name, term in terms.terms.items():
+            value = term.value(s)
+            assert ((value >= 0) & (value <= 1)).all(), name
+
+
+@pytest.fixture(scope="module")
+def task() -> jug.JugEnv:
+    """A batch after its scripted episode, with the stages it went through."""
+    task = tasks.make_task("DoraJug-v1", STARTS, preset="none")
+    assert isinstance(task, jug.JugEnv)
+    task.reset(seed=0)
+    turn = task.snapshot.object_q
+    task.yaw = 2 * torch.atan2(turn[:, 3], turn[:, 0]) % (2 * pi)  # type: ignore[attr-defined]
+    seen, failed = [], torch.zeros(STARTS, dtype=torch.bool)
+    for _ in range(task.max_steps):
+        *_, info = task.step(task.scripted_action())
+        seen.append(info["stage"])
+        failed |= info["fail"]
+    task.history, task.spilt = torch.stack(seen), failed  # type: ignore[attr-defined]
+    return task
+
+
+def test_the_script_lifts_by_the_handle_from_random_starts(task: jug.JugEnv):
+    info = task.evaluate()
+    success = info["success"] & ~task.spilt  # type: ignore[attr-defined]
+    depth = info["penetration_max_mm"]
+    print(f"success {success.float().mean():.2f}, penetration median {depth.median():.2f}, max {depth.max():.2f} mm")
+    assert success.float().mean() >= 0.9
+    for column in task.history[:, success].T:  # type: ignore[attr-defined]
+        assert set(column.tolist()) >= {1, 2, 3}
+
+
+def test_jugs_start_at_any_yaw(task: jug.JugEnv):
+    share = torch.histc(task.yaw, 8, 0, 2 * pi) / STARTS  # type: ignore[attr-defined]
+    assert (share > 0.03).all()
+
+
+def test_falling_over_and_being_dropped_are_failures(task: jug.JugEnv):
+    s = task.snapshot
+    assert not task.failed(s)[task.evaluate()["success"]].any()
+    n = len(s.object_p)
+    lying = jugs(n, object_q=tilted(radians(70)).repeat(n, 1), object_p=s.object_p, start_p=s.start_p)
+    assert task.failed(lying).all()
+    standing = jugs(n, object_p=s.start_p, start_p=s.start_p, supported=torch.ones(n, dtype=torch.bool))
+    assert torch.equal(task.failed(standing), task.episode.highest > jug.DROPPED)
+    assert task.failed(standing).any()
+
+
+def test_masses_range_from_empty_to_full():
+    task = tasks.make_task("DoraJug-v1", 24, preset="standard")
+    task.reset(seed=0)
+    mass = task.episode.mass
+    assert (mass >= jug.EMPTY).all() and (mass <= jug.FULL).all()
+    assert mass.min() < 0.36 and mass.max() > 0.54
+    body = task.target_object._bodies[5]
+    assert body.mass == pytest.approx(mass[5].item())
+    task.close()

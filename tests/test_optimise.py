@@ -1,0 +1,143 @@
+"""The grasp search: reproducible, better than its start, conditioned on a region, on objects of any origin."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from dora.affordance.contact_map import wrist_matrix
+from dora.affordance.energies import GraspEnergy
+from dora.affordance.hand import HandModel
+from dora.affordance.importing import import_object
+from dora.affordance.initial import InitialPoses, Spread
+from dora.affordance.objects import load_object
+from dora.affordance.optimise import opened, optimise, table_of
+from dora.affordance.protocol import STANDARD, pregrasp
+from dora.affordance.search import Search, Settings
+from dora.affordance.signed_distance import ExactDistance, SignedDistanceField
+from dora.errors import InputError
+from dora.robot import load_robot
+
+COUNT = 12
+SHORT = Settings(iterations=60, starts=3)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot("diana7_hit")
+
+
+@pytest.fixture(scope="module")
+def cube(robot):
+    return optimise(load_object("cube"), robot, COUNT, seed=0, settings=SHORT)
+
+
+def test_equal_seeds_give_equal_candidates(robot, cube):
+    again = optimise(load_object("cube"), robot, COUNT, seed=0, settings=SHORT)
+    for name, value in cube.tensors().items():
+        assert torch.equal(value, again.tensors()[name]) or value.isnan().all(), name
+    other = optimise(load_object("cube"), robot, COUNT, seed=1, settings=SHORT)
+    assert not torch.equal(other.position, cube.position)
+
+
+def test_candidates_are_complete(robot, cube):
+    assert len(cube) == COUNT
+    assert torch.allclose(cube.quaternion.norm(dim=-1), torch.ones(COUNT), atol=1e-4)
+    assert torch.allclose(cube.approach.norm(dim=-1), torch.ones(COUNT), atol=1e-4)
+    lower, upper = torch.tensor(robot.hand.lower), torch.tensor(robot.hand.upper)
+    for joints in (cube.joints, cube.pregrasp, cube.grasp):
+        assert ((joints >= lower - 1e-6) & (joints <= upper + 1e-6)).all()
+    assert torch.equal(cube.valid, cube.penetration <= STANDARD.penetration)
+    assert set(cube.grasp_class) <= {"BodyGrasp", "NoContact"}
+
+
+def test_search_lowers_the_energy_and_the_penetration(robot):
+    cube = load_object("cube")
+    start = optimise(cube, robot, COUNT, seed=0, settings=Settings(iterations=1, starts=1, field_size=1))
+    end = optimise(cube, robot, COUNT, seed=0, settings=Settings(iterations=120))
+    for term in ("closure", "distance"):
+        assert end.energy[term].median() < start.energy[term].median()
+    assert end.penetration.median() < 1e-3 < start.penetration.median()
+
+
+def test_hand_stays_above_the_table(robot, cube):
+    hand = HandModel(robot)
+    up = torch.tensor(table_of(load_object("cube")).normal)
+    poses = hand.forward(wrist_matrix(cube.position, cube.quaternion), robot.reduce_hand(cube.joints))
+    lowest = (hand.place(poses, hand.spheres) @ up - hand.sphere_radius).amin(1) + load_object("cube").support
+    assert (lowest > -2e-3).float().mean() > 0.7
+
+
+def test_penetration_is_that_of_the_mesh(robot, cube):
+    hand = HandModel(robot)
+    spheres, radius = hand.sphere_set(sagitta=5e-5)
+    poses = hand.forward(wrist_matrix(cube.position, cube.quaternion), robot.reduce_hand(cube.joints))
+    exact = ExactDistance(load_object("cube").solid)(hand.place(poses, spheres).flatten(0, 1).double().numpy())
+    depth = (radius.numpy() - exact.reshape(COUNT, -1)).max(1).clip(min=0)
+    np.testing.assert_allclose(cube.penetration.numpy(), depth, atol=1.5e-4)
+
+
+def test_region_is_held(robot):
+    found = optimise(load_object("jug"), robot, COUNT, seed=0, region="handle", settings=SHORT)
+    assert found.grasp_class.count("HandleGrasp") >= 0.75 * COUNT
+    with pytest.raises(InputError, match="no region"):
+        optimise(load_object("jug"), robot, COUNT, seed=0, region="lid")
+
+
+def test_progress_reaches_its_end_unless_rows_settle(robot):
+    seen = []
+    optimise(
+        load_object("cube"),
+        robot,
+        4,
+        seed=0,
+        settings=Settings(iterations=10, starts=1, field_size=1, settle=1.0, oversampling=1.0),
+        progress=lambda done, total: seen.append((done, total)),
+    )
+    assert seen[-1][0] == seen[-1][1]
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+
+
+def test_fingers_open_only_as_far_as_there_is_room(robot):
+    hand = HandModel(robot)
+    energy = GraspEnergy(hand, SignedDistanceField(trimesh.creation.box((0.06, 0.06, 0.06))))
+    joints = torch.tensor(robot.postures["home"].hand).float()[None]
+    far = torch.eye(4)[None].clone()
+    far[0, 0, 3] = 1.0
+    assert torch.allclose(opened(energy, far, joints), pregrasp(robot, joints))
+    behind = torch.eye(4)[None].clone()
+    behind[0, :3, 3] = torch.tensor([0.03, 0.0, -0.2])
+    narrow = opened(energy, behind, joints)
+    assert ((narrow - joints).abs() <= (pregrasp(robot, joints) - joints).abs() + 1e-6).all()
+
+
+def test_settled_rows_leave_and_none_is_lost(robot):
+    hand = HandModel(robot)
+    cube = load_object("cube")
+    settings = Settings(iterations=80, settle=0.1, field_size=1)
+    search = Search(
+        GraspEnergy(hand, SignedDistanceField(cube.solid)), InitialPoses(cube, hand, None, Spread()), settings
+    )
+    rows_per_step = []
+    rows = search.run(COUNT, torch.Generator().manual_seed(0), rows_per_step.append)
+    assert len(rows) == COUNT
+    assert len(rows_per_step) <= settings.iterations
+    assert rows_per_step == sorted(rows_per_step, reverse=True)
+
+
+def test_an_imported_mesh_goes_through(robot, tmp_path):
+    path = tmp_path / "bowl.stl"
+    trimesh.creation.capsule(height=0.06, radius=0.022).export(path)
+    found = optimise(import_object(path), robot, 4, seed=0, settings=Settings(iterations=20, starts=1))
+    assert len(found) == 4
+
+
+@pytest.mark.parametrize("wrong", ["iterations", "contacts", "resample", "starts", "batch"])
+def test_wrong_settings_are_refused(wrong):
+    with pytest.raises(InputError, match=wrong):
+        Settings(**{wrong: 0})
+
+
+def test_no_candidate_is_refused(robot):
+    with pytest.raises(InputError, match="at least 1"):
+        optimise(load_object("cube"), robot, 0, seed=0)
