@@ -6,7 +6,9 @@ import sys
 
 import tyro
 
+from dora.affordance import benchmark as grasp_benchmark
 from dora.errors import InputError
+from dora.robot import load_robot
 from dora.sim import benchmark
 
 app = tyro.extras.SubcommandApp()
@@ -30,6 +32,18 @@ def bench_env(
         json: print one JSON object on the last line instead of a table.
     """
     report(dataclasses.asdict(benchmark.measure(env, num_envs, workers, seconds)), json)
+
+
+@app.command(name="grasp")
+def bench_grasp(object: str = "cube", robot: str = "diana7_hit", json: bool = False) -> None:
+    """Grasp candidates per second on one core, against plain pytorch_kinematics and trimesh.
+
+    Args:
+        object: cube, jug, hammer or microwave.
+        robot: folder of the robot.
+        json: print one JSON object on the last line instead of a table.
+    """
+    report(dataclasses.asdict(grasp_benchmark.measure(object, load_robot(robot))), json)
 
 
 def report(result: dict, as_json: bool) -> None:

@@ -42,13 +42,17 @@ def test_the_table_carries_the_cubes(backend, num_envs):
     assert (contacts.separation[:, 0, 1] == torch.inf).all()
 
 
-def test_samples_add_up_over_physics_steps():
-    env, monitor = resting_cubes(dora.sim.BACKEND, 2)
+@pytest.mark.parametrize(("backend", "num_envs"), [("physx_cpu", 1), (dora.sim.BACKEND, 2)])
+def test_contacts_of_every_step_add_up(backend, num_envs):
+    env, monitor = resting_cubes(backend, num_envs)
+    scene = env.unwrapped.scene
     single = monitor.read().impulse[:, 0, 2, 2]
+    groups = {"cube": [scene.actors["cubeA"]], "table": [scene.actors["table-workspace"]]}
+    every = ContactMonitor(scene, groups, every_step=True)
     for _ in range(5):
-        env.unwrapped.scene.step()
-        monitor.sample()
-    assert torch.allclose(monitor.take().impulse[:, 0, 2, 2], 5 * single, rtol=0.05)
+        scene.step()
+    assert torch.allclose(every.take().impulse[:, 0, 1, 2], 5 * single, rtol=0.05)
+    assert (every.take().impulse == 0).all()  # taken
 
 
 def test_a_body_in_two_groups_is_refused():

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dora.tasks import make_task, task_ids
-from dora.tasks.document import page_of, refreshed, tables
+from dora.tasks.document import page_of, preset_table, refreshed, tables
 
 
 @pytest.mark.parametrize("env_id", task_ids())
@@ -14,6 +14,11 @@ def test_the_page_of_every_task_is_up_to_date(project_root: Path, env_id: str):
     page = page_of(env_id, project_root / "docs").read_text()
     assert refreshed(page, tables(task)) == page, "run: python -m dora.tasks.document"
     task.close()
+
+
+def test_the_table_of_presets_is_up_to_date(project_root: Path):
+    page = (project_root / "docs" / "guidance.md").read_text()
+    assert refreshed(page, preset_table()) == page, "run: python -m dora.tasks.document"
 
 
 def test_a_page_without_marks_is_refused():

@@ -9,6 +9,7 @@ from torch import Tensor
 
 import dora.tasks as tasks
 from dora.affordance.objects import load_object
+from dora.affordance.shipped import data_folder
 from dora.tasks import jug
 from dora.tasks.snapshot import CONTACT_CLASSES, Snapshot
 
@@ -94,6 +95,14 @@ def test_every_term_stays_in_bounds_on_random_states():
             assert ((value >= 0) & (value <= 1)).all(), name
 
 
+def test_the_table_of_reachable_candidates_comes_along():
+    table = jug.reach_table()
+    assert (data_folder() / f"reach-{table.digest[:16]}.safetensors").is_file()
+    feasible = table.reason == 0
+    print(f"{feasible.any(1).float().mean():.2f} of the starts, {feasible.sum(1).float().mean():.1f} candidates each")
+    assert feasible.any(1).float().mean() > 0.95
+
+
 @pytest.fixture(scope="module")
 def task() -> jug.JugEnv:
     """A batch after its scripted episode, with the stages it went through."""
@@ -141,8 +150,10 @@ def test_masses_range_from_empty_to_full():
     task = tasks.make_task("DoraJug-v1", 24, preset="standard")
     task.reset(seed=0)
     mass = task.episode.mass
-    assert (mass >= jug.EMPTY).all() and (mass <= jug.FULL).all()
-    assert mass.min() < 0.36 and mass.max() > 0.54
+    assert (mass >= jug.EMPTY).all()
+    assert (mass <= jug.FULL).all()
+    assert mass.min() < 0.36
+    assert mass.max() > 0.54
     body = task.target_object._bodies[5]
     assert body.mass == pytest.approx(mass[5].item())
     task.close()

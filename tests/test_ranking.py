@@ -9,7 +9,7 @@ import torch
 from dora.affordance.objects import load_object
 from dora.errors import InputError
 from dora.robot import load_robot
-from dora.sim.ranking import Execution, lifts_of, rank
+from dora.sim.ranking import Execution, Purpose, lifts_of, rank
 from dora.tasks.cube import hand_made_candidates
 
 ROBOT = load_robot("diana7_hit")
@@ -51,7 +51,8 @@ def test_ranking_and_reporting_draw_differently_and_repeatably(monkeypatch: pyte
     monkeypatch.setattr(
         "dora.sim.ranking.run_cases", lambda _, __, cases, *___: seen.append(cases[0].mass) or [True] * len(cases)
     )
-    for purpose, seed in (("ranking", 0), ("reporting", 0), ("ranking", 0), ("ranking", 1)):
+    calls: list[tuple[Purpose, int]] = [("ranking", 0), ("reporting", 0), ("ranking", 0), ("ranking", 1)]
+    for purpose, seed in calls:
         rank(hand_made_candidates(), CUBE, ROBOT, purpose=purpose, seed=seed)
     assert seen[0] == seen[2]
     assert len(set(seen)) == 3

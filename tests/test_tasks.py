@@ -36,7 +36,7 @@ def roll(task: DoraEnv, steps: Tensor, **reset) -> Tensor:
 
 @pytest.fixture(scope="module", params=tasks.task_ids())
 def batch(request: pytest.FixtureRequest) -> Iterator[DoraEnv]:
-    task = tasks.make_task(request.param, BATCH)
+    task = tasks.make_task(request.param, BATCH, preset="hard")  # with noise, delay and pushes
     yield task
     task.close()
 

@@ -1,6 +1,8 @@
 """The protocol's postures, objects as bodies, and the validation of grasps by simulation."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -116,8 +118,8 @@ def test_maniskill_builds_an_object_per_environment():
     scene = BatchScene(sub_scenes, device=cpu, backend=backend)
     shared = build_object(scene, JUG, friction=0.3)
     sized = build_object(scene, CUBE, "box", sapien.Pose([1.0, 0.0, 0.5]), scale=[1.0, 1.5])
-    halves = [body_of(entity).collision_shapes[0].half_size[0] for entity in sized._objs]
-    np.testing.assert_allclose(halves, [0.03, 0.045], rtol=1e-5)
+    boxes: list[Any] = [body_of(entity).collision_shapes[0] for entity in sized._objs]
+    np.testing.assert_allclose([box.half_size[0] for box in boxes], [0.03, 0.045], rtol=1e-5)
     assert [len(body_of(entity).collision_shapes) for entity in shared._objs] == [len(JUG.pieces)] * 2
     assert shared._objs[0].pose.p[2] == pytest.approx(JUG.support)
     assert "jug" in scene.state_dict_registry.actors
@@ -190,7 +192,7 @@ def _failing(_: int) -> int:
     raise InputError("this case cannot be done.")
 
 
-def make_failing() -> object:
+def make_failing() -> Callable[[int], int]:
     """A task that fails."""
     return _failing
 

@@ -2,6 +2,7 @@
 
 import time
 from collections import Counter
+from collections.abc import Mapping
 
 import pytest
 import torch
@@ -37,7 +38,7 @@ def plain_vote(map: AffordanceMap, contacts, finger, settings: VotingSettings) -
         return NO_CONTACT
     overall = Counter(label for labels in neighbours.values() for label in labels)
 
-    def best(score: dict[int, float]) -> int:
+    def best(score: Mapping[int, float]) -> int:
         return max(score, key=lambda label: (score[label], overall[label], -label))
 
     sums: dict[int, float] = {}

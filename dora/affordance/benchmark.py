@@ -25,17 +25,16 @@ from dora.affordance.optimise import optimise
 from dora.affordance.search import Rows, Search, Settings
 from dora.affordance.signed_distance import CHANNELS, SignedDistanceField
 from dora.affordance.structure import AffordanceObject
-from dora.errors import InputError
 from dora.robot import RobotDescription
 
-BATCHES = (32, 128, 512)
+BATCHES = (32, 128, 256)
 """Candidates searched at once."""
 SUBDIVISIONS = (0, 1, 2)
 """How often the object's faces are divided by four."""
 REFERENCE_ROWS = 8
 """Candidates of the reference, which takes seconds per iteration for more."""
 REFERENCE_ITERATIONS = 3
-REPEATS = 30
+REPEATS = 20
 """Measurements of a part; the fastest counts."""
 
 
@@ -49,7 +48,8 @@ class GraspBenchmark:
         candidates_per_second: of the whole of `optimise`, tables included, at the standard batch.
         by_batch: candidates/s of the search alone, by batch size.
         shares: share of an iteration's time by part: forward kinematics, groups of energy terms, the rest.
-        by_faces: seconds to fill the distance field and candidates/s of the search, by number of faces.
+        by_faces: seconds to fill the distance field and milliseconds of one evaluation of energy and gradient at the
+            standard batch, by number of faces.
         reference_candidates_per_second: of the reference search.
         ratio: candidates/s of the search at the standard batch over those of the reference.
     """
@@ -132,13 +132,12 @@ def _measure(obj: AffordanceObject, robot: RobotDescription, settings: Settings)
         start = time.process_time()
         field = SignedDistanceField(solid)
         filled = time.process_time() - start
-        by_faces[len(solid.faces)] = {"fill_seconds": filled, "rate": _rate(_search(obj, hand, field, settings), 128)}
+        evaluation = _iteration(_search(obj, hand, field, settings), settings.batch, REPEATS)
+        by_faces[len(solid.faces)] = {"fill_seconds": filled, "milliseconds": 1e3 * evaluation}
         solid = solid.subdivide()
     plain = _search(obj, PlainHand(robot), PlainField(obj.solid), settings)
-    ours, reference = (
-        _iteration(search, settings.batch, REPEATS),
-        _iteration(plain, REFERENCE_ROWS, REFERENCE_ITERATIONS),
-    )
+    ours = _iteration(search, settings.batch, REPEATS)
+    reference = _iteration(plain, REFERENCE_ROWS, REFERENCE_ITERATIONS)
     ratio = (reference / REFERENCE_ROWS) / (ours / settings.batch)
     return GraspBenchmark(
         object=obj.name,
@@ -193,6 +192,7 @@ def _shares(search: Search, count: int) -> dict[str, float]:
         "forward_kinematics": lambda: hand.forward(rows.wrist, rows.joints),
         "closure_distance_region": lambda: energy.contact_terms(poses, rows.contacts),
         "penetration_table": lambda: energy.sphere_terms(poses),
+        "closing": lambda: energy.closing(poses, rows.contacts),
         "self_penetration": lambda: energy.self_penetration(poses),
         "limits": lambda: energy.limits(rows.joints),
         "pull_back": lambda: hand.pull_back(poses, wrench),
@@ -204,9 +204,3 @@ def _shares(search: Search, count: int) -> dict[str, float]:
     )
     shares = {name: value / whole for name, value in seconds.items()}
     return shares | {"rest": max(0.0, 1 - sum(shares.values()))}
-
-
-def check_object(name: str, known: tuple[str, ...]) -> None:
-    """Raises InputError if there is no such object."""
-    if name not in known:
-        raise InputError(f"There is no object {name!r}; choose one of: {', '.join(known)}.")

@@ -48,14 +48,14 @@ _SMALL = 1e-9
 class Weights:
     """Weight of every term, per unit of the term; `docs/grasps.md` says why these."""
 
-    closure: float = 1.0
+    closure: float = 2.0
     distance: float = 100.0
     region: float = 50.0
     closing: float = 100.0
-    penetration: float = 300.0
+    penetration: float = 600.0
     table: float = 300.0
     limits: float = 10.0
-    self_penetration: float = 100.0
+    self_penetration: float = 200.0
 
 
 TERMS = tuple(field.name for field in fields(Weights))

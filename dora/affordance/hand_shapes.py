@@ -113,7 +113,8 @@ def _surface(capsule: Capsule) -> tuple[np.ndarray, np.ndarray]:
     axis = capsule.end - capsule.start
     length = float(np.linalg.norm(axis))
     mesh = trimesh.creation.capsule(height=length, radius=capsule.radius, count=[16, 16])
-    pose = trimesh.geometry.align_vectors([0, 0, 1], axis / length) if length > 0 else np.eye(4)
+    turn = trimesh.geometry.align_vectors([0, 0, 1], axis / length) if length > 0 else np.eye(4)
+    pose = np.array(turn, dtype=float)
     pose[:3, 3] = 0.5 * (capsule.start + capsule.end)
     mesh.apply_transform(pose)
     count = max(64, int(mesh.area * SAMPLE_DENSITY))

@@ -33,7 +33,7 @@ class Spread:
         flexion: mean and deviation of all other joints, as a share of their range.
     """
 
-    gap: tuple[float, float] = (0.005, 0.035)
+    gap: tuple[float, float] = (-0.005, 0.025)
     tilt: float = 0.35
     roll: float = 0.2
     abduction: float = 0.08

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.contact_map import hand_contacts

@@ -49,7 +49,7 @@ class Settings:
     """
 
     iterations: int = 200
-    contacts: int = 8
+    contacts: int = 9
     weights: Weights = field(default_factory=Weights)
     ramp: float = 12.0
     ramp_start: float = 0.4
@@ -59,7 +59,7 @@ class Settings:
     field_size: float = 3.0
     halving: float = 0.25
     settle: float = 0.6
-    oversampling: float = 1.0
+    oversampling: float = 1.5
     translation: float = 2e-3
     rotation: float = 0.02
     joint: float = 0.02

@@ -30,8 +30,10 @@ MOST_CUTS = 12
 """Times that a triangle is cut at most."""
 CONTACT_SIZE = 0.004
 """Size of a contact point [m]."""
-VIEWPOINT = 1.3
+VIEWPOINT = 1.0
 """Distance of the first view along x and y, in diagonals of the object."""
+AMBIENT = 1.5
+"""Intensity of the light from everywhere; viser's own lights leave dark links black."""
 REGIONS, CONTACTS = "affordance regions", "contacts of the grasp"
 """What the surface's colours can mean."""
 ANY_VALIDITY, VALID, INVALID = "all", "valid", "not valid"
@@ -200,6 +202,7 @@ class GraspPage:
         self.surface = Surface(obj)
         self.model = HandModel(robot)
         self.server.scene.set_up_direction("+z")
+        self.server.scene.add_light_ambient("/ambient", intensity=AMBIENT)
         away = VIEWPOINT * float(np.linalg.norm(obj.mesh.extents))
         self.server.initial_camera.position = (away, -away, 0.8 * away)
         self.server.initial_camera.look_at = (0.0, 0.0, 0.0)

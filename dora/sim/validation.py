@@ -150,12 +150,12 @@ class GripTest:
         """The hand moves from its opened to its squeezing posture; returns the object's shift [m]."""
         rig, protocol = self.rig, self.protocol
         steps, look = self.physics.steps(protocol.closing_time), self.physics.steps(LOOK)
+        moving = max(1, round(protocol.ramp * steps))
         shift, change = 0.0, case.grasp - case.pregrasp
         rig.damp(protocol.closing_damping)
         for step in range(1, steps + 1):
-            share = step / (protocol.ramp * steps)
-            if share < 1 + 1 / steps / protocol.ramp:
-                rig.hand.command(case.pregrasp + min(share, 1.0) * change)
+            if step <= moving:
+                rig.hand.command(case.pregrasp + step / moving * change)
             rig.step()
             if step % look == 0 or step == steps:
                 shift = float(np.linalg.norm(rig.position - case.position))

@@ -7,6 +7,7 @@ import gymnasium as gym
 
 from dora.errors import InputError
 from dora.tasks import cube as cube
+from dora.tasks import hammer as hammer
 from dora.tasks import jug as jug
 from dora.tasks.base import DoraEnv
 

@@ -1,4 +1,4 @@
-"""Tables of a task, written from the code: `python -m dora.tasks.document` refreshes docs/tasks/.
+"""Tables of tasks and presets, written from the code: `python -m dora.tasks.document` refreshes docs/.
 
 Each page keeps its hand-written part; what stands between the two marks is replaced.
 """
@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dora.tasks import make_task, task_ids
 from dora.tasks.base import DoraEnv
+from dora.tasks.presets import PRESETS
 
 BEGIN, END = "<!-- generated: begin -->", "<!-- generated: end -->"
 
@@ -18,12 +19,12 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 
 
 def tables(task: DoraEnv) -> str:
-    """Markdown tables of observation, action, stages, reward terms and presets of a guided task."""
+    """Markdown tables of observation, action, stages and reward terms of a guided task."""
     s = task.snapshot
     observation, start = [], 0
     for name, entry in task.observation_entries.items():
         size = entry.value(s).shape[-1]
-        who = "guided" if entry.guided else "both"
+        who = "prior" if entry.prior else "guided" if entry.guided else "both"
         observation.append([f"{start}-{start + size - 1}", f"`{name}`", str(size), entry.unit, entry.doc, who])
         start += size
     stages = [[f"`{x.name}`", str(x.hold), f"`{x.back_to}`" if x.back_to else "never"] for x in task.machine.stages]
@@ -54,6 +55,33 @@ def tables(task: DoraEnv) -> str:
     )
 
 
+def _plus_minus(value: float, unit: str, factor: float = 1.0) -> str:
+    return f"+-{factor * value:g}{unit}" if value else "none"
+
+
+def preset_table() -> str:
+    """Markdown table of all presets."""
+    delays = [f"{p.delay} control step{'s' * (p.delay > 1)}" if p.delay else "none" for p in PRESETS.values()]
+    pushes = [f"{p.push:g} N s, {p.push_rate:g} a second" if p.push else "none" for p in PRESETS.values()]
+    rows = {
+        "size": [_plus_minus(p.size, " %", 100.0) for p in PRESETS.values()],
+        "mass": [_plus_minus(p.mass, " %", 100.0) for p in PRESETS.values()],
+        "friction": [
+            f"{low:g} to {high:g}" if low < high else f"{low:g}" for p in PRESETS.values() for low, high in [p.friction]
+        ],
+        "candidate: position": [_plus_minus(p.candidate_position, " mm", 1000.0) for p in PRESETS.values()],
+        "candidate: orientation": [_plus_minus(p.candidate_rotation, " rad") for p in PRESETS.values()],
+        "candidate: finger joints": [_plus_minus(p.candidate_joint, " rad") for p in PRESETS.values()],
+        "observed object position": [_plus_minus(p.seen_position, " mm", 1000.0) for p in PRESETS.values()],
+        "observed object orientation": [_plus_minus(p.seen_rotation, " rad") for p in PRESETS.values()],
+        "observed hand joints": [_plus_minus(p.seen_joint, " rad") for p in PRESETS.values()],
+        "delay of the action": delays,
+        "pushes": pushes,
+    }
+    names = [f"`{name}`" for name in PRESETS]
+    return _table(["what", *names], [[what, *values] for what, values in rows.items()])
+
+
 def refreshed(page: str, generated: str) -> str:
     """The page with its generated part replaced; ValueError if the marks are missing."""
     head, mark, rest = page.partition(BEGIN)
@@ -69,7 +97,9 @@ def page_of(env_id: str, docs: Path) -> Path:
 
 
 def main(docs: Path) -> None:
-    """Refreshes the page of every registered task."""
+    """Refreshes the page of every registered task, and the presets on the page about guidance."""
+    page = docs / "guidance.md"
+    page.write_text(refreshed(page.read_text(), preset_table()))
     for env_id in task_ids():
         task = make_task(env_id, 1, sim_backend="physx_cpu")
         path = page_of(env_id, docs)

@@ -1,7 +1,8 @@
 """What the hammer task reads in addition, and the quantities that its stages, terms and observations share."""
 
-import torch
 from dataclasses import dataclass
+
+import torch
 from jaxtyping import Float
 from torch import Tensor
 

@@ -28,7 +28,7 @@ LATEST = 1.0
 """Longest fall that is predicted [s]."""
 STEEP = 0.5
 """Vertical part of a handle's axis below which it is not followed any more."""
-ROUNDS = 2
+ROUNDS = 4
 """Fixed-point iterations of the time of arrival; the spin between them is small."""
 
 Pose = tuple[Tensor, Tensor]

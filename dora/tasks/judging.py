@@ -29,11 +29,11 @@ class JudgedEnv(BaseEnv):
 
     SUPPORTED_REWARD_MODES = ("dense", "normalized_dense", "sparse", "none", "paper")
 
-    STAGES: ClassVar[Sequence[Stage[Snapshot]]]
+    STAGES: ClassVar[Sequence[Stage[Any]]]
     """The sub-tasks, in order."""
-    TERMS: ClassVar[Terms[Snapshot]]
+    TERMS: ClassVar[Terms[Any]]
     """The reward's terms."""
-    PAPER_TERMS: ClassVar[Terms[Snapshot]]
+    PAPER_TERMS: ClassVar[Terms[Any]]
     """The printed reward, corrected (`reward_mode="paper"`)."""
     EXTRA_OBSERVATIONS: ClassVar[Mapping[str, Entry]] = {}
     """Observation entries beyond `OBSERVATIONS`."""

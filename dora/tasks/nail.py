@@ -26,21 +26,21 @@ TRAVEL = 0.025
 """How far the nail can sink [m]."""
 DRIVEN = 0.010
 """How far blows must drive it [m]."""
-STAND = 0.05
+STAND = 0.08
 """Height of the nail's head above the post before the first blow [m]."""
-HEAD_RADIUS = 0.010
+HEAD_RADIUS = 0.008
 HEAD_HALF = 0.002
 """Radius and half thickness of the nail's head as it is drawn [m]."""
 STOP_HALF = 0.010
-"""Half thickness of the head for collisions [m]: a blow sinks several millimetres into a thin one and comes out below."""
+"""Half thickness of the head for collisions [m]; a blow goes several millimetres into a thin one, and through."""
 SHANK_RADIUS = 0.003
 """Radius of the nail, which is only drawn [m]."""
 POST_HALF = 0.025
 """Half width of the post [m]."""
 MASS = 0.05
 """Mass of the nail [kg]."""
-RESISTANCE = 25.0
-"""Constant force against the hammer [N]; a fifth more than the fingers hold steadily."""
+RESISTANCE = 20.0
+"""Constant force against the hammer [N]."""
 DRAG = 40.0
 """Force per speed against the hammer [N s/m]."""
 DRIVE_LIMIT = 1e4
@@ -70,7 +70,7 @@ class Nail:
     """
 
     def __init__(self, scene: ManiSkillScene, top: tuple[float, float, float], dt: float):
-        self.top, self._dt, self._device = top, dt, scene.device
+        self._place, self._dt, self._device = np.array(top, np.float32), dt, scene.device
         self.articulation = _build(scene, top)
         joint = self.articulation.active_joints[0]
         joint.set_drive_properties(0.0, DRAG, force_limit=DRIVE_LIMIT)
@@ -130,7 +130,7 @@ class Nail:
         """Downward speed of the striking face relative to the nail [m/s]; 0 if the hammer is far away."""
         hammer = self._hammers[i]
         pose = hammer.entity_pose
-        away = pose.p - self.top
+        away = pose.p - self._place
         if away @ away > NEAR * NEAR:
             return 0.0
         arm = pose.to_transformation_matrix()[:3, :3] @ self._faces[i]
@@ -173,23 +173,22 @@ def _build(scene: ManiSkillScene, top: tuple[float, float, float]) -> Articulati
     height = top[2] - STAND
     post = builder.create_link_builder()
     post.set_name("post")
-    centre, half = sapien.Pose([0, 0, -STAND - height / 2]), [POST_HALF, POST_HALF, height / 2]
+    centre, half = sapien.Pose([0, 0, -STAND - height / 2]), (POST_HALF, POST_HALF, height / 2)
     post.add_box_collision(centre, half, material)
     nail = builder.create_link_builder(post)
     nail.set_name("nail")
     axis = sapien.Pose(q=DOWN)
     nail.set_joint_name("nail")
-    nail.set_joint_properties("prismatic", [[0.0, TRAVEL]], axis, axis, friction=0.0, damping=0.0)
+    nail.set_joint_properties("prismatic", [[0.0, TRAVEL]], axis, axis)
     head = sapien.Pose([0, 0, -HEAD_HALF], DOWN)
     density = MASS / (np.pi * HEAD_RADIUS**2 * 2 * STOP_HALF)
-    nail.add_cylinder_collision(
-        sapien.Pose([0, 0, -STOP_HALF], DOWN), HEAD_RADIUS, STOP_HALF, material, density=density
-    )
+    stop = sapien.Pose([0, 0, -STOP_HALF], DOWN)
+    nail.add_cylinder_collision(stop, HEAD_RADIUS, STOP_HALF, material, density=density)
     if scene.can_render():
         pine, iron = (sapien.render.RenderMaterial(base_color=list(c), roughness=0.6) for c in (PINE, IRON))
         post.add_box_visual(centre, half, pine)
         nail.add_cylinder_visual(head, HEAD_RADIUS, HEAD_HALF, iron)
-        nail.add_cylinder_visual(sapien.Pose([0, 0, -TRAVEL], DOWN), SHANK_RADIUS, TRAVEL, iron)
+        nail.add_cylinder_visual(sapien.Pose([0, 0, -STAND / 2], DOWN), SHANK_RADIUS, STAND / 2, iron)
     builder.initial_pose = sapien.Pose(list(top))
     articulation = builder.build("nail", fix_root_link=True)
     for link in articulation.links:

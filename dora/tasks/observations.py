@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,7 +30,7 @@ class Entry:
             all other guided entries belong to the part "observation".
     """
 
-    value: Callable[[Snapshot], Tensor]
+    value: Callable[[Any], Tensor]
     unit: str
     doc: str
     guided: bool = False

@@ -111,7 +111,7 @@ def derived(function: Derived) -> Derived:
 
 
 def derived_from_contacts(function: Derived) -> Derived:
-    """The same for a quantity of the contacts and the object's size alone, which the noise of sensors leaves as it is."""
+    """The same for a quantity of contacts and the object's size alone, which the noise of sensors leaves as it is."""
     return _once(function, FROM_CONTACTS)
 
 
