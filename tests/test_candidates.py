@@ -98,6 +98,7 @@ def test_concatenate_fills_what_a_set_lacks(candidates: GraspCandidates):
     joined = concatenate([candidates, few])
     assert joined.grasp_class == candidates.grasp_class + few.grasp_class
     assert torch.equal(joined.position, torch.cat([candidates.position, few.position]))
+    assert torch.equal(joined.contacts[COUNT:, :2], few.contacts)
     assert joined.contact_finger[COUNT:, 2:].eq(0).all()
     assert joined.energy["distance"][COUNT:].isnan().all()
     assert joined.energy["joints"][:COUNT].isnan().all()

@@ -16,7 +16,7 @@ from dora.robot.rotations import quaternion_apply, quaternion_from_rotation_vect
 from dora.sim.substeps import watch_physics
 from dora.tasks import hammer
 from dora.tasks.catching import ALIGN, PHASES, CatchReference
-from dora.tasks.hammer_snapshot import HammerSnapshot, face_to_nail, handle_distance, misalignment
+from dora.tasks.hammer_snapshot import GRIP, HammerSnapshot, face_to_nail, handle_distance, misalignment
 from dora.tasks.hammering import Strike, arrival, blend, compose, fall_time, fallen, inverse, relative, slew, slid
 from dora.tasks.nail import BLOW_SPEED, TRAVEL
 
@@ -101,7 +101,8 @@ def test_a_slid_pose_is_at_the_height_and_on_the_axis():
 
 def test_slewing_is_bounded_and_arrives():
     torch.manual_seed(0)
-    here, goal = random_pose(16), random_pose(16)
+    (p, q), goal = random_pose(16), random_pose(16)
+    here = 0.1 * p + goal[0], q
     for _ in range(400):
         new = slew(here, goal, 0.01, 0.05)
         assert ((new[0] - here[0]).norm(dim=-1) <= 0.0101).all()
@@ -147,7 +148,7 @@ def caught(n: int, **given: Tensor) -> HammerSnapshot:
     """Hammers at the middle of the grip, two fingers on them."""
     touch = torch.zeros(n, 6, dtype=torch.bool)
     touch[:, 1:3] = True
-    grip = torch.tensor(hammer.GRIP).repeat(n, 1)
+    grip = torch.tensor(GRIP).repeat(n, 1)
     return invented(n, **({"object_p": grip, "touch": touch} | given))
 
 
@@ -156,7 +157,7 @@ def test_catching_needs_place_fingers_and_rest():
     assert done(caught(1)).all()
     assert not done(caught(1, touch=torch.zeros(1, 6, dtype=torch.bool))).any()
     assert not done(caught(1, object_v=torch.tensor([[0.0, 0.0, -0.6]]))).any()
-    assert not done(caught(1, object_p=torch.tensor([[0.045, 0.0, 0.30]]))).any()
+    assert not done(caught(1, object_p=torch.tensor([[0.145, 0.0, 0.15]]))).any()
     # what moves along with the hand rests in it
     moving = torch.tensor([[0.0, 1.0, 0.0]])
     assert done(caught(1, object_v=moving, wrist_v=moving)).all()
@@ -177,7 +178,7 @@ def test_orientation_is_judged_between_striking_axis_and_nail_axis():
     q = quaternion_multiply(
         quaternion_from_rotation_vector(torch.stack([tilt, 0 * tilt, 0 * tilt], -1)), FLAT.expand(n, 4)
     )
-    p = torch.tensor(hammer.GRIP).repeat(n, 1)
+    p = torch.tensor(GRIP).repeat(n, 1)
     nail_p = p + quaternion_apply(q, torch.tensor(FACE).repeat(n, 1)) - torch.tensor([0.0, 0.0, 0.05])
     nail_p[3, 0] += 0.02
     s = caught(n, object_p=p, object_q=q, nail_p=nail_p)
@@ -272,7 +273,7 @@ def test_a_blow_drives_the_nail_and_a_harder_one_drives_it_further(bench: hammer
     print(f"1.0 m/s: {soft[1]:.2f} mm, 1.6 m/s: {hard[1]:.2f} mm")
     assert 0.5 < soft[1] < hard[1] < 8
     assert hard[1] > 2
-    assert hard[1] == pytest.approx(hard[0], abs=1e-3)
+    assert hard[1] == pytest.approx(hard[0], abs=0.05)
 
 
 def test_leaning_and_pushing_do_not_count(bench: hammer.HammerEnv):

@@ -73,7 +73,7 @@ def test_description(candidates: GraspCandidates):
     text = describe(candidates, 2)
     assert "**BodyGrasp** (candidate 2)" in text
     assert "not valid" in text
-    assert "lifted in 82 %" in text
+    assert "succeeded in 82 %" in text
     assert "closure: 2" in text
 
 

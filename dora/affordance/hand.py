@@ -118,6 +118,7 @@ class HandModel:
         unit = self.robot.expand_hand(np.eye(len(self.robot.hand_actuated)))
         zero = self.robot.expand_hand(np.zeros(len(self.robot.hand_actuated)))
         lower, upper = np.full(shape, -np.inf), np.full(shape, np.inf)
+        index = np.zeros(shape, dtype=int)
         for finger, chain in enumerate(chains):
             fixed, level = np.eye(4), 0
             for joint in chain:
@@ -129,13 +130,16 @@ class HandModel:
                 place, name = (finger, level), self.robot.hand.names.index(joint.name)
                 terms[(slice(None), *place)] = [fixed @ term for term in rodrigues(joint.axis)]
                 axes[place] = joint.axis / np.linalg.norm(joint.axis)
+                index[place] = name
                 gain[place], offset[place] = unit[:, name] - zero[name], zero[name]
                 lower[place], upper[place] = self.robot.hand.lower[name], self.robot.hand.upper[name]
                 fixed, level = np.eye(4), level + 1
-        self._constant, self._cosine, self._sine = (self._tensor(term) for term in terms)
-        self._axes = self._tensor(axes).flatten(0, 1)
-        self.joint_gain, self._offset = self._tensor(gain).flatten(0, 1), self._tensor(offset).flatten()
+        self.constant, self.cosine, self.sine = (self._tensor(term) for term in terms)
+        self.axes = self._tensor(axes).flatten(0, 1)
+        self.joint_gain, self.joint_offset = self._tensor(gain).flatten(0, 1), self._tensor(offset).flatten()
         self.joint_lower, self.joint_upper = self._tensor(lower).flatten(), self._tensor(upper).flatten()
+        self.joint_index = self._index(index).flatten()
+        """(joints,) index in the order of `RobotDescription.hand`; 0 for padding, which turns nothing."""
         low, high = _actuated_limits(gain, offset, lower, upper)
         self.lower, self.upper = self._tensor(low), self._tensor(high)
 
@@ -213,7 +217,7 @@ class HandModel:
     def forward(self, wrist: Float[Tensor, "c 4 4"], actuated: Float[Tensor, "c a"]) -> Float[Tensor, "c b 4 4"]:
         """Poses of all bodies in the frame in which `wrist` is given; `actuated` joints in rad."""
         angle = self.all_joints(actuated).unflatten(-1, (self.fingers, self.depth))[..., None, None]
-        local = torch.addcmul(self._constant, self._cosine, angle.cos()).addcmul_(self._sine, angle.sin())
+        local = torch.addcmul(self.constant, self.cosine, angle.cos()).addcmul_(self.sine, angle.sin())
         pose = wrist[:, None]
         found = []
         for level in range(self.depth):
@@ -223,7 +227,7 @@ class HandModel:
 
     def all_joints(self, actuated: Float[Tensor, "c a"]) -> Float[Tensor, "c j"]:
         """Angles (rad) of all joints, finger by finger from the palm outwards, padding included as 0."""
-        return torch.addmm(self._offset, actuated, self.joint_gain.T)
+        return torch.addmm(self.joint_offset, actuated, self.joint_gain.T)
 
     def place(self, poses: Float[Tensor, "c b 4 4"], points: Points) -> Float[Tensor, "c p 3"]:
         """Points in the frame of `poses` (m)."""
@@ -252,7 +256,7 @@ class HandModel:
         moment = total[:, 3:] - torch.linalg.cross(poses[:, 0, :3, 3], total[:, :3])
         beyond = (wrench.mT.reshape(-1, wrench.shape[1]) @ self._above).view(len(wrench), 6, -1).mT
         frames = poses[:, 1:]
-        axis = (frames[..., :3, :3] @ self._axes[..., None]).squeeze(-1)
+        axis = (frames[..., :3, :3] @ self.axes[..., None]).squeeze(-1)
         lever = beyond[..., 3:] - torch.linalg.cross(frames[..., :3, 3], beyond[..., :3])
         return torch.cat((total[:, :3], moment), 1), (axis * lever).sum(-1) @ self.joint_gain
 

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates, hand_digest
+from dora.affordance.compiled import CompiledEnergy
 from dora.affordance.contact_map import hand_contacts
 from dora.affordance.energies import GraspEnergy, Table
 from dora.affordance.hand import HandModel
@@ -75,7 +76,8 @@ def optimise(
     hand = HandModel(robot, device=device)
     field = SignedDistanceField(obj.solid, None if region is None else obj.region(region), device=device)
     on_table = obj.name not in OFF_TABLE if settings.table is None else settings.table
-    energy = GraspEnergy(hand, field, settings.weights, table_of(obj) if on_table else None)
+    kind = CompiledEnergy if hand.device.type == "cpu" else GraspEnergy
+    energy = kind(hand, field, settings.weights, table_of(obj) if on_table else None)
     search = Search(energy, InitialPoses(obj, hand, region, settings.spread), settings)
     wanted = math.ceil(num * settings.oversampling)
     sizes = [min(settings.batch, wanted - start) for start in range(0, wanted, settings.batch)]

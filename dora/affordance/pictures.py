@@ -95,7 +95,7 @@ def caption(candidates: GraspCandidates, row: int) -> str:
     if np.isfinite(depth):
         words.append(f"{1000 * depth:.1f} mm deep")
     if np.isfinite(score):
-        words.append(f"lifted {score:.2f}")
+        words.append(f"score {score:.2f}")
     return ", ".join(words)
 
 

@@ -24,6 +24,19 @@ def shipped_path(name: str) -> Path:
     return data_folder() / f"{name}.safetensors"
 
 
+def best_candidates(name: str, grasp_class: str, least: float, most: int) -> GraspCandidates:
+    """The shipped candidates of one class that succeeded often enough, best first.
+
+    Args:
+        name: one of our objects.
+        grasp_class: such as "HandleGrasp".
+        least: smallest score (share of executions that succeeded); candidates without one are left out.
+        most: largest number of candidates.
+    """
+    found = load_candidates(name)
+    return found.select(found.of_class(grasp_class) & (found.score >= least)).select(slice(most))
+
+
 def load_candidates(name: str, robot: RobotDescription | None = None) -> GraspCandidates:
     """The shipped, validated and ranked candidates of an object of ours, best first.
 

@@ -35,7 +35,7 @@ MAX_NODES = 1.6e7
 CHANNELS = 4
 """Columns of a field's table without the region: distance (m) and unit gradient (3,)."""
 _TINY = 1e-12
-_CULL = 1.25
+CULL = 1.25
 """|interpolated value - value at the nearest node| is at most this times the spacing, gradients being unit."""
 
 
@@ -135,7 +135,7 @@ class SignedDistanceField:
         """
         node = torch.clamp(self._place(points).round_(), self._zero, self._last) @ self._strides
         near = self._distance.index_select(0, node.int().flatten()).view(node.shape)
-        return (near < reach + _CULL * self.spacing).flatten().nonzero().squeeze(1)
+        return (near < reach + CULL * self.spacing).flatten().nonzero().squeeze(1)
 
     def _place(self, points: Tensor) -> Tensor:
         """Positions in units of the spacing, from the first node."""

@@ -75,7 +75,7 @@ def describe(candidates: GraspCandidates, row: int) -> str:
     lines = [
         f"**{candidates.grasp_class[row]}** (candidate {row})",
         f"- {'valid' if candidates.valid[row] else 'not valid'}",
-        f"- lifted in {100 * score:.0f} % of the simulations" if np.isfinite(score) else "- not ranked",
+        f"- succeeded in {100 * score:.0f} % of its executions" if np.isfinite(score) else "- not ranked",
         f"- {1000 * float(candidates.penetration[row]):.2f} mm into the object",
         f"- {1000 * float(candidates.self_penetration[row]):.2f} mm into itself",
         f"- contacts: {', '.join(names[f] for f in touching) or 'none'}",

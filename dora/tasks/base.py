@@ -38,6 +38,8 @@ class DoraEnv(BuiltEnv):
 
     def reachable(self, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]) -> Bool[Tensor, "b c"]:
         """f_reach: which candidates the arm can grasp without collision when the object stands like this."""
+        if self.reach_table is not None:
+            return self.reach_table.mask(object_p, object_q)
         return torch.ones(len(object_p), len(self.guide.choice.candidates), dtype=torch.bool, device=self.device)
 
     def extended(self, s: Snapshot) -> Snapshot:
@@ -113,6 +115,7 @@ class DoraEnv(BuiltEnv):
         wrist_p, wrist_q = (x.expand(len(env_idx), -1) for x in self._home)
         choice, reachable = self.guide.choice, self.reachable(object_p, object_q)
         wanted = reachable if FILTER in self.parts else torch.ones_like(reachable)
+        wanted = wanted if self.narrow is None else self.narrow(wanted)
         index = choice.nearest(object_p, object_q, wrist_p, wrist_q, wanted)
         choice.choose(env_idx, index, reachable.any(-1), error, self.preset)
         self.guide.begin(env_idx, wrist_p, wrist_q)

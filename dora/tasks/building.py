@@ -1,7 +1,8 @@
 """The part of a task that is built: options, scene, candidates."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,6 +15,9 @@ from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, 
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
+from dora.affordance.objects import load_object
+from dora.affordance.reach import Reach
+from dora.affordance.reach_table import Grid, ReachTable
 from dora.sim.properties import ObjectProperties
 from dora.sim.robot import DescribedRobot
 from dora.tasks.choice import Choice
@@ -37,6 +41,7 @@ class BuiltEnv(JudgedEnv):
             and "prior"; all by default.
         hand_joints: 20 independent hand targets, or 15 with distal joints coupled to medial ones.
         preset: how much episodes are randomised, see `dora.tasks.presets`.
+        grasps: candidates in place of those that come with Dora, of the task's object and robot.
         robot_uids: name of a folder in `robots/`.
         sim_backend: as in ManiSkill; "auto" on a machine without CUDA is "physx_cpu", or "physx_cpu_batch" for
             num_envs > 1.
@@ -65,6 +70,13 @@ class BuiltEnv(JudgedEnv):
     HOME: ClassVar[str] = "home"
     """Name of the robot's posture at the start of an episode."""
 
+    OBJECT: ClassVar[str]
+    """Name of the object, as `load_object` knows it."""
+    START: ClassVar[Grid | None] = None
+    """Where the object may stand at the start, for the table of f_reach; None where it does not stand."""
+
+    narrow: Callable[[Tensor], Tensor] | None = None
+    """Takes the (b, c) candidates that b new episodes may use and returns fewer; to try candidates one by one."""
     agent: DescribedRobot
     target_object: Actor
     object_half: Tensor
@@ -92,6 +104,7 @@ class BuiltEnv(JudgedEnv):
         guidance_parts: Sequence[str] | None = None,
         hand_joints: int = 20,
         preset: str = "standard",
+        grasps: GraspCandidates | None = None,
         robot_uids: Any = "diana7_hit",
         num_envs: int = 1,
         control_mode: str | None = None,
@@ -105,7 +118,7 @@ class BuiltEnv(JudgedEnv):
             guidance, guidance_parts, hand_joints, preset, robot_uids, num_envs, control_mode,
             sim_backend, render_backend, render_mode, obs_mode,
         )  # fmt: skip
-        self.parts, self.preset = options.parts, options.preset
+        self.parts, self.preset, self._grasps = options.parts, options.preset, grasps
         self._shares: dict[str, float] = {}
         self._forced_scale: Tensor | None = None
         super().__init__(
@@ -153,13 +166,23 @@ class BuiltEnv(JudgedEnv):
         self._reader = SimulatorReader(self.scene, self.agent, *bodies, points, self.CONTACT_EVERY_STEP)
         self._properties = ObjectProperties(self.target_object)
         self._load_judgement()
-        choice = Choice(self.candidates(), self.num_envs, self.device)
+        choice = Choice(self._grasps or self.candidates(), self.num_envs, self.device)
         correction = Correction(*size, self.BOUNDS, self.device)
         self.guide = Guide(self.parts, choice, self.make_reference(), correction)
         self.guide.anneal(**self._shares)
         self.disturbances = Disturbances(self.preset, *size, self.CONTROL_FREQUENCY, self.device)
         self.episode = Episode(*size, points, self.device)
         self._home = self.agent.posture_wrist(self.HOME)
+
+    @cached_property
+    def reach_table(self) -> ReachTable | None:
+        """f_reach of the candidates over the places where the object may stand; built once and cached on disk."""
+        if self.START is None:
+            return None
+        obj = load_object(self.OBJECT)
+        reach = Reach(self.agent.description, obj, start=self.HOME)
+        candidates = self.guide.choice.candidates.to("cpu")
+        return ReachTable.of(reach, candidates, self.START, obj.support, obj.rest).to(self.device)
 
     def _draw_scale(self) -> Tensor:
         """(n,) relative sizes, one draw from each environment's own stream."""

@@ -1,6 +1,6 @@
 """DoraCube-v1: grasp a cube on a table and lift it."""
 
-from math import cos, pi, sin
+from math import pi
 from typing import ClassVar
 
 import numpy as np
@@ -12,11 +12,12 @@ from sapien.physx import PhysxMaterial
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.robot.rotations import quaternion_apply, quaternion_multiply
+from dora.affordance.reach_table import Grid
+from dora.affordance.shipped import best_candidates
 from dora.tasks.base import DoraEnv
 from dora.tasks.observations import Entry
 from dora.tasks.rewards import Term, Terms, closeness
-from dora.tasks.snapshot import Snapshot, derived, goal_error, in_wrist, lifted, opposed, tips_in_object
+from dora.tasks.snapshot import Snapshot, derived, goal_error, lifted, opposed, tips_in_object
 from dora.tasks.stages import Stage
 
 HALF = 0.03
@@ -39,10 +40,12 @@ HOLD = 10
 """Control steps the lifted cube must be held."""
 DEEPEST = 0.003
 """Penetration above which an episode does not count as a success [m]."""
-HAND_CENTRE = (0.061, 0.005, 0.168)
-"""Where a grasped cube's centre lies in the hand frame [m]."""
 ALPHA = 4.0
 """Spatial sensitivity of the affordance reward [1/m]."""
+MOST = 40
+"""Stored candidates that the task works with."""
+FEWEST_LIFTS = 0.75
+"""Share of executions in the task that a stored candidate must have survived to be one of them."""
 
 
 @derived
@@ -68,11 +71,6 @@ def _held(s: Snapshot) -> Tensor:
     return (lifted(s) > LIFT) & opposed(s) & ~s.supported
 
 
-def _away(s: Snapshot) -> Tensor:
-    centre = torch.tensor(HAND_CENTRE, device=s.object_p.device)
-    return (in_wrist(s, s.object_p) - centre).norm(dim=-1)
-
-
 STAGES: list[Stage[Snapshot]] = [
     Stage("reach", lambda s: closeness(_reach(s), NEAR, 0.25), lambda s: _reach(s) < NEAR),
     Stage(
@@ -83,7 +81,7 @@ STAGES: list[Stage[Snapshot]] = [
         lost=lambda s: _reach(s) > 4 * NEAR,
         back_to="reach",
     ),
-    Stage("lift", _rise, _held, hold=HOLD, lost=lambda s: _away(s) > 0.12, back_to="reach"),
+    Stage("lift", _rise, _held, hold=HOLD, lost=lambda s: _reach(s) > 4 * NEAR, back_to="reach"),
 ]
 
 
@@ -160,47 +158,6 @@ PAPER_TERMS: Terms[Snapshot] = Terms(
     }
 )
 
-# A short list made by hand, until the optimiser's candidates replace it: wrist pitch [rad], cube centre in the hand
-# frame [m], and finger postures (proximal, medial of the four fingers; the same of the thumb) [rad].
-HAND_MADE = (
-    {
-        "pitch": 0.892,
-        "centre": (0.061, 0.005, 0.168),
-        "open": (0.091, 0.052, 0.0, 0.358),
-        "closed": (0.887, 0.215, 0.354, 0.0),
-    },
-)
-THUMB_ABDUCTION = -0.003
-"""Abduction of the thumb in the hand-made candidates [rad]."""
-
-
-def _posture(fingers: tuple[float, float, float, float]) -> list[float]:
-    proximal, medial, thumb_proximal, thumb_medial = fingers
-    thumb = [THUMB_ABDUCTION, thumb_proximal, thumb_medial, thumb_medial]
-    return thumb + [0.0, proximal, medial, medial] * 4
-
-
-def hand_made_candidates() -> GraspCandidates:
-    """One top grasp, turned by quarter turns about the vertical: the cube looks the same after each."""
-    position, quaternion, pre, grasp = [], [], [], []
-    # With pitch 0 the fingers (hand z) point along +x and the palm (hand x) faces down.
-    level = torch.tensor([cos(pi / 4), 0.0, sin(pi / 4), 0.0])
-    for make in HAND_MADE:
-        for quarter in range(4):
-            yaw = torch.tensor([cos(quarter * pi / 4), 0.0, 0.0, sin(quarter * pi / 4)])
-            pitch = torch.tensor([cos(make["pitch"] / 2), 0.0, sin(make["pitch"] / 2), 0.0])
-            turn = quaternion_multiply(quaternion_multiply(yaw, pitch), level)
-            quaternion.append(turn)
-            position.append(-quaternion_apply(turn, torch.tensor(make["centre"])))
-            pre.append(torch.tensor(_posture(make["open"])))
-            grasp.append(torch.tensor(_posture(make["closed"])))
-    count = len(position)
-    down = torch.tensor([0.0, 0.0, -1.0]).repeat(count, 1)
-    return GraspCandidates(
-        "cube", torch.stack(position), torch.stack(quaternion), down, torch.stack(pre), torch.stack(grasp),
-        ("BodyGrasp",) * count,
-    )  # fmt: skip
-
 
 @register_env("DoraCube-v1", max_episode_steps=100)
 class CubeEnv(DoraEnv):
@@ -226,9 +183,11 @@ class CubeEnv(DoraEnv):
     DRAWS = 3
     MAX_STEPS = 100
     DEEPEST = DEEPEST
+    OBJECT = "cube"
+    START = Grid(CENTRE, (SPREAD, SPREAD))
 
     def candidates(self) -> GraspCandidates:
-        return hand_made_candidates()
+        return best_candidates(self.OBJECT, "BodyGrasp", FEWEST_LIFTS, MOST)
 
     def load_object(self, scale: np.ndarray) -> Actor:
         """One cube per sub-scene, each with its own size and material, merged into one actor."""

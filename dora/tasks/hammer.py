@@ -66,8 +66,8 @@ UNKNOWN = 1e3
 """In-hand motion before the window is full [m]."""
 
 # One power grasp around the handle, found by a cross-entropy search over catches, until the optimiser's candidates
-# replace it: where the hand holds the handle, the axes of the hand in the hammer frame, finger postures (proximal, medial
-# of the four fingers and of the thumb).
+# replace it: where the hand holds the handle, the axes of the hand in the hammer frame, and finger postures (proximal
+# and medial joints of the four fingers, then those of the thumb).
 HELD_AT = (-0.0028, 0.0, -0.12)
 """Point of the handle's axis in the middle of the hand [m], hammer frame."""
 HELD_IN = (0.043, 0.0, 0.115)
@@ -249,7 +249,9 @@ class HammerEnv(DoraEnv):
     # ------------------------------------------------------------------ state
 
     def get_state_dict(self) -> dict:
-        return super().get_state_dict() | {"nail": self.nail.get_state() | {"history": self._history.flatten(1)}}
+        return super().get_state_dict() | {
+            "nail": self.nail.get_state() | {"history": self._history.flatten(1).clone()}
+        }
 
     def set_state_dict(self, state: dict, env_idx: Tensor | None = None) -> None:
         super().set_state_dict(state, env_idx)

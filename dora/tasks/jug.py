@@ -14,12 +14,10 @@ from torch import Tensor
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.map import AffordanceMap
 from dora.affordance.objects import load_object
-from dora.affordance.reach import Reach
-from dora.affordance.reach_table import Grid, ReachTable
-from dora.affordance.shipped import data_folder, load_candidates
+from dora.affordance.reach_table import Grid
+from dora.affordance.shipped import best_candidates
 from dora.affordance.structure import AffordanceObject
 from dora.affordance.voting import vote
-from dora.robot import load_robot
 from dora.robot.rotations import quaternion_apply, quaternion_from_rotation_vector
 from dora.sim.objects import build_object
 from dora.tasks.base import DoraEnv
@@ -81,28 +79,6 @@ def jug() -> AffordanceObject:
 def jug_map() -> AffordanceMap:
     """Its affordance map."""
     return AffordanceMap.from_object(jug())
-
-
-@cache
-def stored_candidates() -> GraspCandidates:
-    """The best of the shipped handle grasps: validated and ranked, at most `MOST` of them."""
-    found = load_candidates("jug")
-    return found.select(found.of_class(CLASS) & ~(found.score < FEWEST_LIFTS)).select(slice(MOST))
-
-
-@cache
-def reach_table() -> ReachTable:
-    """f_reach of those candidates over the area and the yaws at which the jug may start."""
-    reach = Reach(load_robot(JugEnv.SUPPORTED_ROBOTS[0]), jug(), start=JugEnv.HOME)
-    return ReachTable.of(reach, stored_candidates(), Grid(CENTRE, (SPREAD, SPREAD)), jug().support, jug().rest)
-
-
-def ship_reach_table() -> None:
-    """Puts the table into the folder of data that come with Dora; for whoever has made new candidates."""
-    for old in data_folder().glob("reach-*.safetensors"):
-        old.unlink()
-    table = reach_table()
-    table.save(data_folder() / f"reach-{table.digest[:16]}.safetensors")
 
 
 def _scale(s: Snapshot) -> Float[Tensor, " n"]:
@@ -317,9 +293,11 @@ class JugEnv(DoraEnv):
     DEEPEST = DEEPEST
     CONTACT_POINTS = 32
     HOME = "above"
+    OBJECT = "jug"
+    START = Grid(CENTRE, (SPREAD, SPREAD))
 
     def candidates(self) -> GraspCandidates:
-        return stored_candidates()
+        return best_candidates(self.OBJECT, CLASS, FEWEST_LIFTS, MOST)
 
     def load_object(self, scale: np.ndarray) -> Actor:
         half = torch.as_tensor(jug().mesh.extents / 2, dtype=torch.float32, device=self.device)
@@ -329,9 +307,6 @@ class JugEnv(DoraEnv):
     def masses(self, nominal: Float[Tensor, " b"], u: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
         """Anything from empty to full, or half full with a preset that does not vary masses."""
         return EMPTY + (FULL - EMPTY) * u if self.preset.mass > 0 else nominal
-
-    def reachable(self, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]) -> Bool[Tensor, "b c"]:
-        return reach_table().mask(object_p, object_q)
 
     def place(self, env_idx: Tensor, u: Tensor) -> None:
         u = u.reshape(-1, TRIES, 3)

@@ -1,0 +1,279 @@
+"""Whether a squeezing hand would hold: quasi-static equilibrium of drives, contacts with friction, and weight.
+
+A model, not a simulation of motion: the drives are springs with limited torque, hand and object push each other
+apart with stiff springs at the spheres of the hand, friction is a spring along the surface that slides at Coulomb's
+limit. The hand closes from its open posture to its squeezing command, then the weight acts along every direction of the
+protocol; what moves is found by descent with momentum, without masses. The search ranks its candidates by the result.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numba import njit
+from torch import Tensor
+
+from dora.affordance.compiled import CompiledEnergy, _cross, _forward, _near, _point, _pull_back, _push, _sample
+from dora.affordance.protocol import DIRECTIONS, STANDARD, Protocol
+
+STIFFNESS = 4e3
+"""Of the contact of one sphere, across and along the surface (N/m); grips overlap by millimetres then."""
+CLOSING_STEPS, SETTLING_STEPS, WEIGHT_STEPS = 60, 30, 25
+"""Steps of descent while the command moves, until the grip rests, and for every direction of the weight."""
+MOMENTUM = 0.7
+LARGEST_STEP = 3e-3
+"""Largest step of the object (m, and in units of `ARM` rad) and of the fingers."""
+ARM = 0.04
+"""Typical distance (m) of contacts from the middle of the grip."""
+SPARE = 5.0
+"""Contacts on whose stiffness the step sizes count in addition to those that exist."""
+FINGER_CONTACTS = 4.0
+"""Contacts on whose stiffness the step sizes of the joints count."""
+LOST = 0.06
+"""Displacement (m) at which a grasp is given up."""
+
+
+class Holding(NamedTuple):
+    """Result of `hold` for c candidates.
+
+    Attributes:
+        shift: (c,) how far closing moves the object (m).
+        displacement: (c, 6) farthest the object is from where closing left it, up to every direction (m).
+        force: (c,) sum of normal forces after closing (N).
+    """
+
+    shift: Float[Tensor, " c"]
+    displacement: Float[Tensor, "c 6"]
+    force: Float[Tensor, " c"]
+
+
+class _Drives(NamedTuple):
+    stiffness: np.ndarray
+    effort: np.ndarray
+    damping: np.ndarray
+
+
+def hold(
+    energy: CompiledEnergy,
+    wrist: Float[Tensor, "c 4 4"],
+    opened: Float[Tensor, "c j"],
+    squeezed: Float[Tensor, "c j"],
+    mass: float,
+    protocol: Protocol = STANDARD,
+) -> Holding:
+    """Close and load every candidate.
+
+    Args:
+        energy: knows hand and object.
+        wrist: pose of the wrist in the object frame.
+        opened: all hand joints before closing (rad), in the order of `RobotDescription.hand`.
+        squeezed: command of all hand joints.
+        mass: of the object (kg).
+        protocol: has friction, gravity.
+    """
+    hand, robot = energy.hand, energy.hand.robot.hand
+    arrays = energy.arrays()
+    joints, order = len(arrays.axes), hand.joint_index
+    free = arrays._replace(
+        leader=np.arange(joints), gain=np.ones(joints), offset=np.zeros(joints), close=np.zeros(joints)
+    )
+    index = order.numpy()
+    lever = _levers(hand)
+    drives = _Drives(
+        robot.stiffness[index].astype(float),
+        robot.effort[index].astype(float),
+        1 / (robot.stiffness[index] + FINGER_CONTACTS * STIFFNESS * lever**2),
+    )
+    center = torch.as_tensor(hand.grip.center + ARM * hand.grip.normal).double().numpy()
+    numbers = np.array([mass * protocol.gravity, protocol.friction])
+    result = _hold(
+        free,
+        energy.field_arrays(),
+        drives,
+        center,
+        numbers,
+        np.array(DIRECTIONS),
+        wrist.double().numpy(),
+        opened[:, order].double().numpy(),
+        squeezed[:, order].double().numpy(),
+    )
+    found = torch.from_numpy(result).to(wrist)
+    return Holding(found[:, 0], found[:, 2:], found[:, 1])
+
+
+def _levers(hand) -> np.ndarray:
+    """Distance (m) from every joint to the farthest sphere beyond it, straight hand."""
+    eye = torch.eye(4, dtype=hand.dtype)[None]
+    poses = hand.forward(eye, torch.zeros_like(hand.lower)[None])
+    centers = hand.place(poses, hand.spheres)[0]
+    found = np.zeros(hand.fingers * hand.depth)
+    body = hand.spheres.body
+    for joint in range(len(found)):
+        last = (joint // hand.depth + 1) * hand.depth
+        beyond = centers[(body > joint) & (body <= last)]
+        if len(beyond):
+            found[joint] = float((beyond - poses[0, joint + 1, :3, 3]).norm(dim=-1).max())
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _hold(hand, field, drives, center, numbers, directions, wrists, opened, squeezed):
+    count, joints = opened.shape
+    bodies, spheres = joints + 1, len(hand.sphere_body)
+    result = np.zeros((count, 2 + len(directions)))
+    angles, poses, wrench = np.zeros(joints), np.zeros((bodies, 3, 4)), np.zeros((bodies, 6))
+    value, slope = np.zeros(1), np.zeros((1, 3))
+    local, anchor, touching = np.zeros((spheres, 3)), np.zeros((spheres, 3)), np.zeros(spheres, np.bool_)
+    gradient, speed = np.zeros(6 + joints), np.zeros(6 + joints)
+    weight, first = np.zeros(3), np.zeros(3)
+    for row in range(count):
+        wrist, q = wrists[row].copy(), opened[row].copy()
+        start = wrists[row]
+        touching[:] = False
+        speed[:] = 0.0
+        weight[:] = 0.0
+        command = opened[row].copy()
+        for step in range(CLOSING_STEPS + SETTLING_STEPS):
+            share = min(1.0, (step + 1) / CLOSING_STEPS)
+            for j in range(joints):
+                command[j] = opened[row, j] + share * (squeezed[row, j] - opened[row, j])
+            _forward(hand, wrist, q, 0.0, angles, poses)
+            force = _relax(
+                hand, field, drives, center, numbers[1], weight, wrist, q, command, poses, wrench, value, slope,
+                local, anchor, touching, gradient, speed,
+            )
+        result[row, 1] = force
+        for i in range(3):
+            first[i] = _object(wrist, i)
+            result[row, 0] += (first[i] - _object(start, i)) ** 2
+        result[row, 0] = math.sqrt(result[row, 0])
+        farthest = 0.0
+        for d in range(len(directions)):
+            for step in range(WEIGHT_STEPS):
+                if farthest < LOST:
+                    for i in range(3):
+                        weight[i] = 0.0
+                        for k in range(3):
+                            for m in range(3):
+                                weight[i] += numbers[0] * wrist[i, k] * start[m, k] * directions[d, m]
+                    _forward(hand, wrist, q, 0.0, angles, poses)
+                    _relax(
+                        hand, field, drives, center, numbers[1], weight, wrist, q, command, poses, wrench, value, slope,
+                        local, anchor, touching, gradient, speed,
+                    )
+                    moved = 0.0
+                    for i in range(3):
+                        moved += (_object(wrist, i) - first[i]) ** 2
+                    farthest = max(farthest, math.sqrt(moved))
+            result[row, 2 + d] = farthest
+    return result
+
+
+@njit(cache=True, error_model="numpy")
+def _object(wrist, axis):
+    """Position of the object's origin in the wrist's frame, along one axis."""
+    return -(wrist[0, axis] * wrist[0, 3] + wrist[1, axis] * wrist[1, 3] + wrist[2, axis] * wrist[2, 3])
+
+
+@njit(cache=True, error_model="numpy")
+def _relax(
+    hand, field, drives, center, friction, weight, wrist, q, command, poses, wrench, value, slope,
+    local, anchor, touching, gradient, speed,
+):
+    """One step of descent of all forces; returns the sum of normal forces."""
+    wrench[:] = 0.0
+    gradient[:] = 0.0
+    total, contacts = 0.0, SPARE
+    for s in range(len(hand.sphere_body)):
+        body, radius = hand.sphere_body[s], hand.sphere_radius[s]
+        point = _point(poses, body, hand.sphere_local, s)
+        if not _near(field, point, radius):
+            touching[s] = False
+            continue
+        _sample(field, field.distance, point, value, slope)
+        depth = radius - value[0]
+        if depth <= 0.0:
+            touching[s] = False
+            continue
+        contacts += 1
+        length = max(math.sqrt(slope[0, 0] ** 2 + slope[0, 1] ** 2 + slope[0, 2] ** 2), 1e-9)
+        n = (slope[0, 0] / length, slope[0, 1] / length, slope[0, 2] / length)
+        normal = STIFFNESS * depth
+        total += normal
+        if not touching[s]:
+            touching[s] = True
+            _hold_on(poses, body, point, n, radius, local, anchor, s)
+        here = _point(poses, body, local, s)
+        slip = (here[0] - anchor[s, 0], here[1] - anchor[s, 1], here[2] - anchor[s, 2])
+        along = slip[0] * n[0] + slip[1] * n[1] + slip[2] * n[2]
+        t = (slip[0] - along * n[0], slip[1] - along * n[1], slip[2] - along * n[2])
+        size = STIFFNESS * math.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
+        share = 1.0
+        if size > friction * normal:
+            share = friction * normal / size
+            for i in range(3):
+                anchor[s, i] = here[i] - share * t[i]
+        k = share * STIFFNESS
+        _push(
+            wrench,
+            body,
+            here,
+            (k * t[0] - normal * n[0], k * t[1] - normal * n[1], k * t[2] - normal * n[2]),
+        )
+    _push(wrench, 0, (0.0, 0.0, 0.0), weight)
+    _pull_back(hand, poses, wrench, gradient)
+    for j in range(len(q)):
+        torque = drives.stiffness[j] * (q[j] - command[j])
+        torque = min(max(torque, -drives.effort[j]), drives.effort[j])
+        change = -(gradient[6 + j] + torque) * drives.damping[j]
+        speed[6 + j] = MOMENTUM * speed[6 + j] + change
+        q[j] = min(max(q[j] + min(max(speed[6 + j], -0.05), 0.05), hand.lower[j]), hand.upper[j])
+    _move(wrist, center, contacts * STIFFNESS, gradient, speed)
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _hold_on(poses, body, point, n, radius, local, anchor, s):
+    """A sphere begins to touch: its material point and the object's point there."""
+    for i in range(3):
+        anchor[s, i] = point[i] - radius * n[i]
+    for k in range(3):
+        local[s, k] = 0.0
+        for i in range(3):
+            local[s, k] += poses[body, i, k] * (anchor[s, i] - poses[body, i, 3])
+
+
+@njit(cache=True, error_model="numpy")
+def _move(wrist, center, stiffness, gradient, speed):
+    """Moves the wrist, which is the object seen from the hand, by a step about the middle of the grip."""
+    pivot, arm = np.empty(3), np.empty(3)
+    for i in range(3):
+        pivot[i] = wrist[i, 3] + wrist[i, 0] * center[0] + wrist[i, 1] * center[1] + wrist[i, 2] * center[2]
+        arm[i] = wrist[i, 3] - pivot[i]
+    lever = _cross(arm, gradient)
+    size = 0.0
+    for i in range(3):
+        speed[i] = MOMENTUM * speed[i] - gradient[i] / stiffness
+        speed[3 + i] = MOMENTUM * speed[3 + i] - (gradient[3 + i] + lever[i]) / (stiffness * ARM**2)
+        size = max(size, abs(speed[i]), ARM * abs(speed[3 + i]))
+    if size > LARGEST_STEP:
+        for i in range(6):
+            speed[i] *= LARGEST_STEP / size
+    angle = math.sqrt(speed[3] ** 2 + speed[4] ** 2 + speed[5] ** 2)
+    turn = np.eye(3)
+    if angle > 1e-12:
+        a, b, c = speed[3] / angle, speed[4] / angle, speed[5] / angle
+        cosine, sine = math.cos(angle), math.sin(angle)
+        rest = 1 - cosine
+        turn[0, 0], turn[0, 1], turn[0, 2] = cosine + a * a * rest, a * b * rest - c * sine, a * c * rest + b * sine
+        turn[1, 0], turn[1, 1], turn[1, 2] = b * a * rest + c * sine, cosine + b * b * rest, b * c * rest - a * sine
+        turn[2, 0], turn[2, 1], turn[2, 2] = c * a * rest - b * sine, c * b * rest + a * sine, cosine + c * c * rest
+    old = wrist.copy()
+    for i in range(3):
+        for k in range(3):
+            wrist[i, k] = turn[i, 0] * old[0, k] + turn[i, 1] * old[1, k] + turn[i, 2] * old[2, k]
+        wrist[i, 3] = pivot[i] + speed[i] + turn[i, 0] * arm[0] + turn[i, 1] * arm[1] + turn[i, 2] * arm[2]

@@ -1,0 +1,107 @@
+"""Rank candidates by executing them in their task: whole episodes of the scripted solution, randomised and judged.
+
+What a simulated hand without an arm holds (`dora.sim.validation`) an arm cannot always reach, and what it reaches it
+does not always lift without pressing too deep. The task itself is the last judge.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dora.affordance.candidates import GraspCandidates
+from dora.tasks import make_task
+from dora.tasks.base import DoraEnv
+
+BATCH = 64
+"""Episodes that run together."""
+CLEAN = 2 / 3
+"""Share of the task's penetration limit within which an execution counts: what barely passes will not do so again."""
+SEED = 10_000
+"""First seed; far from those of training and evaluation, so that scores are not made on their starts."""
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What executing c candidates showed.
+
+    Attributes:
+        tries: episodes in which each one led; few or none where the arm seldom reaches it.
+        score: share of them that succeeded; 0 without a try.
+    """
+
+    tries: Int[Tensor, " c"]
+    score: Float[Tensor, " c"]
+
+
+class _Balanced:
+    """Gives every new episode the reachable candidate that has been tried least."""
+
+    def __init__(self, count: int, generator: torch.Generator):
+        self.tries = torch.zeros(count, dtype=torch.long)
+        self.generator = generator
+        self.led = torch.empty(0, dtype=torch.long)
+        self.possible = torch.empty(0, dtype=torch.bool)
+
+    def __call__(self, reachable: Bool[Tensor, "b c"]) -> Bool[Tensor, "b c"]:
+        able = reachable.cpu()
+        chance = torch.rand(able.shape, generator=self.generator)
+        chosen = []
+        for row, luck in zip(able, chance, strict=True):
+            best = int(torch.where(row, self.tries + luck, torch.inf).argmin())
+            self.tries[best] += int(row[best])
+            chosen.append(best)
+        self.led, self.possible = torch.tensor(chosen), able.any(-1)
+        only = torch.zeros_like(able)
+        only[torch.arange(len(able)), self.led] = True
+        return only.to(reachable.device) & reachable
+
+
+def prove(
+    env_id: str,
+    candidates: GraspCandidates,
+    episodes: int,
+    preset: str = "standard",
+    progress: Callable[[int, int], None] | None = None,
+    seed: int = SEED,
+) -> Proof:
+    """Executes c candidates in a task, each about equally often, where f_reach lets them.
+
+    Args:
+        env_id: the task.
+        candidates: grasps of its object.
+        episodes: in all, rounded up to whole batches of 64.
+        preset: how the episodes are randomised; with candidate error, so that fragile grasps fail.
+        progress: is called with (episodes done, episodes).
+        seed: of starts and errors.
+    """
+    task = make_task(env_id, BATCH, preset=preset, grasps=candidates)
+    pick = _Balanced(len(candidates), torch.Generator().manual_seed(seed))
+    task.narrow = pick
+    wins, rounds = torch.zeros(len(candidates)), -(-episodes // BATCH)
+    for index in range(rounds):
+        success = _executed(task, seed + index)
+        wins.index_add_(0, pick.led, (success.cpu() & pick.possible).float())
+        if progress is not None:
+            progress((index + 1) * BATCH, rounds * BATCH)
+    task.close()
+    return Proof(pick.tries, wins / pick.tries.clamp(min=1))
+
+
+def _executed(task: DoraEnv, seed: int) -> Bool[Tensor, " n"]:
+    """Which of n episodes the scripted solution ends with success, without failing on the way, and cleanly."""
+    task.reset(seed=seed)
+    failed = torch.zeros(task.num_envs, dtype=torch.bool, device=task.device)
+    info: dict[str, Tensor] = {}
+    for _ in range(task.max_steps):
+        *_, info = task.step(task.scripted_action())
+        failed |= info["fail"]
+    return info["success"] & ~failed & (task.episode.deepest <= CLEAN * task.DEEPEST)
+
+
+def ranked(candidates: GraspCandidates, proof: Proof) -> GraspCandidates:
+    """The candidates with the proof's scores, best first; among equals, those that were reached more often."""
+    order = torch.argsort(proof.score + 1e-6 * proof.tries, descending=True, stable=True)
+    return replace(candidates, score=proof.score).select(order)
