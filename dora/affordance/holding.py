@@ -33,6 +33,10 @@ SPARE = 5.0
 """Contacts on whose stiffness the step sizes count in addition to those that exist."""
 FINGER_CONTACTS = 4.0
 """Contacts on whose stiffness the step sizes of the joints count."""
+MUCH = 0.01
+"""Displacement (m) that outweighs an e-fold of force."""
+SHIFT_SHARE = 0.3
+"""What a shift by closing counts against a displacement under weight."""
 LOST = 0.06
 """Displacement (m) at which a grasp is given up."""
 
@@ -49,6 +53,11 @@ class Holding(NamedTuple):
     shift: Float[Tensor, " c"]
     displacement: Float[Tensor, "c 6"]
     force: Float[Tensor, " c"]
+
+    @property
+    def quality(self) -> Float[Tensor, " c"]:
+        """What ranks candidates: a firm grip that moves little, log(1 + force) less what moves in `MUCH`."""
+        return self.force.log1p() - (self.displacement[:, -1] + SHIFT_SHARE * self.shift) / MUCH
 
 
 class _Drives(NamedTuple):

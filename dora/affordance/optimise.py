@@ -15,6 +15,7 @@ from dora.affordance.compiled import CompiledEnergy
 from dora.affordance.contact_map import hand_contacts
 from dora.affordance.energies import GraspEnergy, Table
 from dora.affordance.hand import HandModel
+from dora.affordance.holding import hold
 from dora.affordance.initial import InitialPoses
 from dora.affordance.map import AffordanceMap
 from dora.affordance.measures import Penetration, self_penetration
@@ -37,6 +38,8 @@ OPENINGS = (0.25, 0.5, 0.75, 1.0)
 """Shares of the protocol's opening that are tried."""
 OPENING_DEPTH = 1e-3
 """Overlap (m) with the object up to which a finger counts as clear of it."""
+CHECKED = 1.25
+"""Candidates whose penetration is measured exactly, per candidate wanted."""
 NO_CLASS = "NoContact"
 """Grasp class of a candidate without contact."""
 
@@ -112,15 +115,16 @@ def _candidates(
 ) -> GraspCandidates:
     """The `num` best rows, measured and classified."""
     hand, robot = energy.hand, energy.hand.robot
-    wrist, joints = rows.wrist, rows.joints
-    found = energy(wrist, joints, rows.contacts, settings.ramp)
-    poses = hand.forward(wrist, joints)
+    found = energy(rows.wrist, rows.joints, rows.contacts, settings.ramp)
+    quality, predicted = _quality(obj, energy, rows, found.total)
+    likely = quality.argsort(descending=True)[: math.ceil(CHECKED * num)]
+    poses = hand.forward(rows.wrist[likely], rows.joints[likely])
     depth, self_depth = Penetration(hand, energy.field)(poses), self_penetration(energy, poses)
-    invalid = depth > STANDARD.penetration
-    crossed = self_depth > STANDARD.strict_self_penetration
-    worst = found.total.max()
-    best = (found.total + (2 * invalid + 1 * crossed) * worst).argsort()[:num]
-    poses, joints, wrist = poses[best], joints[best], wrist[best]
+    invalid = (depth > STANDARD.penetration).long()
+    crossed = (self_depth > STANDARD.strict_self_penetration).long()
+    order = (2 * invalid + crossed).argsort(stable=True)[:num]
+    best = likely[order]
+    poses, joints, wrist = poses[order], rows.joints[best], rows.wrist[best]
     points, finger = hand_contacts(hand, energy.field, poses)
     held = vote(AffordanceMap.from_object(obj).to(points.device), points, finger)
     full = robot.expand_hand(joints)
@@ -136,15 +140,29 @@ def _candidates(
         joints=full,
         contacts=points,
         contact_finger=finger,
-        energy={name: value[best] for name, value in found.terms.items()},
-        penetration=depth[best],
-        self_penetration=self_depth[best],
-        valid=~invalid[best],
+        energy={name: value[best] for name, value in (found.terms | predicted).items()},
+        penetration=depth[order],
+        self_penetration=self_depth[order],
+        valid=invalid[order] == 0,
         digest=obj.digest,
         robot=robot.name,
         robot_digest=hand_digest(robot),
         settings=repr(settings),
     )
+
+
+def _quality(obj: AffordanceObject, energy: GraspEnergy, rows: Rows, total: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    """What candidates are ranked by (c,), more is better, and the predictions it is made of."""
+    if not isinstance(energy, CompiledEnergy):
+        return -total, {}
+    robot = energy.hand.robot
+    full = robot.expand_hand(rows.joints)
+    held = hold(energy, rows.wrist, pregrasp(robot, full), squeeze(robot, full), obj.mass)
+    return held.quality, {
+        "predicted_shift": held.shift,
+        "predicted_displacement": held.displacement[:, -1],
+        "predicted_force": held.force,
+    }
 
 
 def opened(energy: GraspEnergy, wrist: Float[Tensor, "c 4 4"], joints: Float[Tensor, "c j"]) -> Float[Tensor, "c j"]:
