@@ -23,6 +23,7 @@ from dora.robot import load_robot
 from dora.sim.grasp_report import check_out, print_report, write_report
 from dora.sim.grasps import baselines, generate, summary
 from dora.sim.shipping import ship
+from dora.tasks.proving import EPISODES, TASKS, prove_shipped
 
 INTERRUPTED = 130  # exit status after Ctrl-C
 BAD_INPUT = 2  # exit status after input that a person can mend
@@ -58,7 +59,10 @@ class Args:
     baselines: int = 64
     """Candidates of each baseline; 0 leaves the baselines out."""
     ship: bool = False
-    """Make the set that comes with Dora for --object instead: enough valid grasps, ranked by simulated lifts."""
+    """Make the set that comes with Dora for --object instead: enough valid grasps, ranked by simulated lifts; then
+    what --prove does, where the object has a task with a table."""
+    prove: bool = False
+    """Execute the set that comes with Dora for --object in its task, and rank it by the episodes that succeed."""
 
 
 def target(args: Args) -> tuple[AffordanceObject, str | None]:
@@ -102,13 +106,24 @@ def run(args: Args) -> None:
     print(out)
 
 
+def remake(args: Args) -> None:
+    """Make or prove the shipped set of an object."""
+    name = args.object or ""
+    if not args.ship and name not in TASKS:
+        raise InputError(f"--prove needs --object, one of {', '.join(TASKS)}: no task proves {name!r}.")
+    with PhaseProgress() as phases:
+        if args.ship:
+            print(ship(name, args.seed, phases))
+        if name in TASKS:
+            print(prove_shipped(name, EPISODES, phases.phase(f"{name}: execute in {TASKS[name]}", "episodes")))
+
+
 def main() -> int:
     """Run the command; returns the exit status."""
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     try:
-        if args.ship:
-            with PhaseProgress() as phases:
-                print(ship(args.object or "", args.seed, phases))
+        if args.ship or args.prove:
+            remake(args)
         else:
             run(args)
     except InputError as error:

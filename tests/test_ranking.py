@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from dora.affordance.objects import load_object
+from dora.affordance.shipped import load_candidates
 from dora.errors import InputError
 from dora.robot import load_robot
 from dora.sim.ranking import Execution, Purpose, lifts_of, rank
-from dora.tasks.cube import hand_made_candidates
 
 ROBOT = load_robot("diana7_hit")
 CUBE = load_object("cube")
@@ -18,7 +18,7 @@ EXACT = Execution(draws=2, position=0.0, rotation=0.0, friction=(0.85, 1.0), mas
 
 
 def test_a_good_grasp_lifts_and_bad_ones_do_not():
-    good = hand_made_candidates().select([0])
+    good = load_candidates("cube").select([0])
     away = replace(good, position=good.position + torch.tensor([0.0, 0.0, 0.15]))
     below = replace(good, position=good.position - torch.tensor([0.0, 0.0, 0.08]))
     limp = replace(good, grasp=good.pregrasp)
@@ -27,13 +27,13 @@ def test_a_good_grasp_lifts_and_bad_ones_do_not():
 
 
 def test_a_mass_beyond_its_strength_is_not_lifted():
-    good = hand_made_candidates().select([0])
+    good = load_candidates("cube").select([0])
     heavy = replace(EXACT, mass=(100.0, 100.0))
     assert float(rank(good, CUBE, ROBOT, heavy, processes=1)) == 0.0
 
 
 def test_draws_are_within_range_shared_by_candidates_and_new_for_reporting():
-    candidates, execution = hand_made_candidates(), Execution(draws=50)
+    candidates, execution = load_candidates("cube").select(slice(4)), Execution(draws=50)
     lifts = lifts_of(candidates, CUBE, execution, np.random.default_rng(0))
     assert len(lifts) == 50 * len(candidates)
     mass = np.array([lift.mass for lift in lifts]).reshape(-1, 50)
@@ -53,7 +53,7 @@ def test_ranking_and_reporting_draw_differently_and_repeatably(monkeypatch: pyte
     )
     calls: list[tuple[Purpose, int]] = [("ranking", 0), ("reporting", 0), ("ranking", 0), ("ranking", 1)]
     for purpose, seed in calls:
-        rank(hand_made_candidates(), CUBE, ROBOT, purpose=purpose, seed=seed)
+        rank(load_candidates("cube").select(slice(4)), CUBE, ROBOT, purpose=purpose, seed=seed)
     assert seen[0] == seen[2]
     assert len(set(seen)) == 3
 

@@ -152,8 +152,24 @@ def _hold(hand, field, drives, center, numbers, directions, wrists, opened, sque
                 command[j] = opened[row, j] + share * (squeezed[row, j] - opened[row, j])
             _forward(hand, wrist, q, 0.0, angles, poses)
             force = _relax(
-                hand, field, drives, center, numbers[1], weight, wrist, q, command, poses, wrench, value, slope,
-                local, anchor, touching, gradient, speed,
+                hand,
+                field,
+                drives,
+                center,
+                numbers[1],
+                weight,
+                wrist,
+                q,
+                command,
+                poses,
+                wrench,
+                value,
+                slope,
+                local,
+                anchor,
+                touching,
+                gradient,
+                speed,
             )
         result[row, 1] = force
         for i in range(3):
@@ -171,8 +187,24 @@ def _hold(hand, field, drives, center, numbers, directions, wrists, opened, sque
                                 weight[i] += numbers[0] * wrist[i, k] * start[m, k] * directions[d, m]
                     _forward(hand, wrist, q, 0.0, angles, poses)
                     _relax(
-                        hand, field, drives, center, numbers[1], weight, wrist, q, command, poses, wrench, value, slope,
-                        local, anchor, touching, gradient, speed,
+                        hand,
+                        field,
+                        drives,
+                        center,
+                        numbers[1],
+                        weight,
+                        wrist,
+                        q,
+                        command,
+                        poses,
+                        wrench,
+                        value,
+                        slope,
+                        local,
+                        anchor,
+                        touching,
+                        gradient,
+                        speed,
                     )
                     moved = 0.0
                     for i in range(3):
@@ -190,8 +222,24 @@ def _object(wrist, axis):
 
 @njit(cache=True, error_model="numpy")
 def _relax(
-    hand, field, drives, center, friction, weight, wrist, q, command, poses, wrench, value, slope,
-    local, anchor, touching, gradient, speed,
+    hand,
+    field,
+    drives,
+    center,
+    friction,
+    weight,
+    wrist,
+    q,
+    command,
+    poses,
+    wrench,
+    value,
+    slope,
+    local,
+    anchor,
+    touching,
+    gradient,
+    speed,
 ):
     """One step of descent of all forces; returns the sum of normal forces."""
     wrench[:] = 0.0

@@ -1,0 +1,61 @@
+"""Ranking candidates by executing them in their task, and what of it comes with Dora."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dora.affordance.candidates import concatenate
+from dora.affordance.shipped import data_folder, load_candidates
+from dora.tasks import make_task
+from dora.tasks.proving import TASKS, Proof, _Balanced, prove, ranked
+
+
+def test_a_proof_tells_a_good_grasp_from_one_in_the_air():
+    good = load_candidates("cube").select([0])
+    away = replace(good, position=good.position + torch.tensor([0.0, 0.0, 0.10]))
+    proof = prove("DoraCube-v1", concatenate([away, good]), 64, preset="none")
+    assert proof.tries.sum() <= 64
+    assert (proof.tries > 10).all()
+    assert proof.score[1] > 0.8
+    assert proof.score[0] == 0
+    best_first = ranked(concatenate([away, good]), proof)
+    torch.testing.assert_close(best_first.position[0], good.position[0])
+    assert best_first.score.tolist() == sorted(proof.score.tolist(), reverse=True)
+
+
+def test_every_reachable_candidate_is_tried_equally_often_and_no_other():
+    pick = _Balanced(4, torch.Generator().manual_seed(0))
+    reachable = torch.tensor([[True, True, False, False]] * 6 + [[True, True, True, False]] * 6)
+    only = pick(reachable)
+    assert (only.sum(-1) == 1).all()
+    assert (only & ~reachable).sum() == 0
+    assert pick.tries[3] == 0
+    assert pick.tries[:3].sum() == 12
+    assert pick.tries[:3].max() - pick.tries[:3].min() <= 1
+
+
+def test_a_start_without_any_candidate_is_no_try():
+    pick = _Balanced(2, torch.Generator().manual_seed(0))
+    only = pick(torch.zeros(3, 2, dtype=torch.bool))
+    assert not only.any()
+    assert not pick.possible.any()
+    assert pick.tries.sum() == 0
+
+
+def test_among_equals_the_one_reached_more_often_is_first():
+    two = load_candidates("cube").select([0, 1])
+    best_first = ranked(two, Proof(torch.tensor([3, 9]), torch.tensor([1.0, 1.0])))
+    torch.testing.assert_close(best_first.position, two.position[[1, 0]])
+
+
+@pytest.mark.parametrize("env_id", TASKS.values())
+def test_the_table_of_reachable_candidates_comes_along(env_id: str):
+    task = make_task(env_id, 1)
+    table = task.reach_table
+    task.close()
+    assert table is not None
+    assert (data_folder() / f"reach-{table.digest[:16]}.safetensors").is_file()
+    feasible = table.reason == 0
+    print(f"{feasible.any(1).float().mean():.2f} of the starts, {feasible.sum(1).float().mean():.1f} candidates each")
+    assert feasible.any(1).float().mean() > 0.95
