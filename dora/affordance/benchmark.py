@@ -196,7 +196,7 @@ def _shares(search: Search, count: int) -> dict[str, float]:
         "self_penetration": lambda: energy.self_penetration(poses),
         "limits": lambda: energy.limits(rows.joints),
         "pull_back": lambda: hand.pull_back(poses, wrench),
-        "adam": lambda: search.descend(rows, found, 0),
+        "adam": lambda: search.descend(rows, found, 0, 0.0),
     }
     seconds = {name: min(_seconds(part) for _ in range(REPEATS)) for name, part in parts.items()}
     whole = seconds["adam"] + min(

@@ -171,7 +171,7 @@ def _evaluate(hand, field, weights, plane, wrist, joints, contacts):
             hand, field, weights[_CLOSING], closed, contacts[row], value, slope, wrench_closed
         )
         _sphere_terms(hand, field, weights, plane, poses, value, slope, terms[row], wrench)
-        terms[row, _SELF] = _self_penetration(hand, weights[_SELF], poses, wrench)
+        terms[row, _SELF] = _self_penetration(hand, weights[_SELF], 0.0, poses, wrench)
         terms[row, _LIMITS] = _limits(hand, weights[_LIMITS], angles, gradient[row])
         _pull_back(hand, poses, wrench, gradient[row])
         _pull_back(hand, closed, wrench_closed, gradient[row])
@@ -383,7 +383,8 @@ def _sphere_terms(hand, field, weights, plane, poses, value, slope, terms, wrenc
 
 
 @njit(cache=True, error_model="numpy")
-def _self_penetration(hand, weight, poses, wrench):
+def _self_penetration(hand, weight, stiffness, poses, wrench):
+    """Sum of overlaps (m); capsules part with a force of `weight` and of `stiffness` times the overlap."""
     capsules = len(hand.radius)
     ends, middle = np.empty((2 * capsules, 3)), np.empty((capsules, 3))
     for e in range(2 * capsules):
@@ -396,12 +397,12 @@ def _self_penetration(hand, weight, poses, wrench):
         a, b = pairs[q, 0], pairs[q, 1]
         x, y, z = middle[a, 0] - middle[b, 0], middle[a, 1] - middle[b, 1], middle[a, 2] - middle[b, 2]
         if x * x + y * y + z * z < bound[q]:
-            total += _overlap(hand, weight, a, b, ends, wrench)
+            total += _overlap(hand, weight, stiffness, a, b, ends, wrench)
     return total
 
 
 @njit(cache=True, error_model="numpy")
-def _overlap(hand, weight, a, b, ends, wrench):
+def _overlap(hand, weight, stiffness, a, b, ends, wrench):
     """Overlap (m) of two capsules, and the forces that part them."""
     uu = vv = ww = uv = uw = vw = 0.0
     for i in range(3):
@@ -417,7 +418,7 @@ def _overlap(hand, weight, a, b, ends, wrench):
         return 0.0
     first, second = _between(ends, a, s), _between(ends, b, t)
     distance = math.sqrt(max(square, 0.0))
-    w = -weight / max(distance, _SMALL)
+    w = -(weight + stiffness * (limit - distance)) / max(distance, _SMALL)
     force = (w * (first[0] - second[0]), w * (first[1] - second[1]), w * (first[2] - second[2]))
     _push(wrench, hand.capsule_body[a], first, force)
     _push(wrench, hand.capsule_body[b], second, (-force[0], -force[1], -force[2]))

@@ -17,13 +17,21 @@ from jaxtyping import Float
 from numba import njit
 from torch import Tensor
 
-from dora.affordance.compiled import CompiledEnergy, _cross, _forward, _near, _point, _pull_back, _push, _sample
+from dora.affordance.compiled import (
+    CompiledEnergy,
+    _cross,
+    _forward,
+    _near,
+    _point,
+    _pull_back,
+    _push,
+    _sample,
+    _self_penetration,
+)
 from dora.affordance.protocol import DIRECTIONS, STANDARD, Protocol
 
 STIFFNESS = 4e3
 """Of the contact of one sphere, across and along the surface (N/m); grips overlap by millimetres then."""
-CLOSING_STEPS, SETTLING_STEPS, WEIGHT_STEPS = 60, 30, 25
-"""Steps of descent while the command moves, until the grip rests, and for every direction of the weight."""
 MOMENTUM = 0.7
 LARGEST_STEP = 3e-3
 """Largest step of the object (m, and in units of `ARM` rad) and of the fingers."""
@@ -48,16 +56,28 @@ class Holding(NamedTuple):
         shift: (c,) how far closing moves the object (m).
         displacement: (c, 6) farthest the object is from where closing left it, up to every direction (m).
         force: (c,) sum of normal forces after closing (N).
+        wrist: (c, 4, 4) pose of the wrist in the object frame after closing.
+        joints: (c, j) all hand joints after closing (rad), in the order of `RobotDescription.hand`.
     """
 
     shift: Float[Tensor, " c"]
     displacement: Float[Tensor, "c 6"]
     force: Float[Tensor, " c"]
+    wrist: Float[Tensor, "c 4 4"]
+    joints: Float[Tensor, "c j"]
 
     @property
     def quality(self) -> Float[Tensor, " c"]:
         """What ranks candidates: a firm grip that moves little, log(1 + force) less what moves in `MUCH`."""
         return self.force.log1p() - (self.displacement[:, -1] + SHIFT_SHARE * self.shift) / MUCH
+
+
+class Steps(NamedTuple):
+    """Steps of descent: while the command moves, until the grip rests, and for every direction of the weight."""
+
+    closing: int = 100
+    settling: int = 50
+    weight: int = 50
 
 
 class _Drives(NamedTuple):
@@ -73,6 +93,7 @@ def hold(
     squeezed: Float[Tensor, "c j"],
     mass: float,
     protocol: Protocol = STANDARD,
+    steps: Steps = Steps(),
 ) -> Holding:
     """Close and load every candidate.
 
@@ -99,19 +120,23 @@ def hold(
     )
     center = torch.as_tensor(hand.grip.center + ARM * hand.grip.normal).double().numpy()
     numbers = np.array([mass * protocol.gravity, protocol.friction])
+    end, final = wrist.double().numpy().copy(), opened[:, order].double().numpy()
     result = _hold(
         free,
+        steps,
         energy.field_arrays(),
         drives,
         center,
         numbers,
         np.array(DIRECTIONS),
-        wrist.double().numpy(),
-        opened[:, order].double().numpy(),
+        end,
+        final,
         squeezed[:, order].double().numpy(),
     )
     found = torch.from_numpy(result).to(wrist)
-    return Holding(found[:, 0], found[:, 2:], found[:, 1])
+    joints = opened.clone()
+    joints[:, order] = torch.from_numpy(final).to(opened)
+    return Holding(found[:, 0], found[:, 2:], found[:, 1], torch.from_numpy(end).to(wrist), joints)
 
 
 def _levers(hand) -> np.ndarray:
@@ -130,7 +155,7 @@ def _levers(hand) -> np.ndarray:
 
 
 @njit(cache=True, error_model="numpy")
-def _hold(hand, field, drives, center, numbers, directions, wrists, opened, squeezed):
+def _hold(hand, steps, field, drives, center, numbers, directions, wrists, opened, squeezed):
     count, joints = opened.shape
     bodies, spheres = joints + 1, len(hand.sphere_body)
     result = np.zeros((count, 2 + len(directions)))
@@ -141,13 +166,13 @@ def _hold(hand, field, drives, center, numbers, directions, wrists, opened, sque
     weight, first = np.zeros(3), np.zeros(3)
     for row in range(count):
         wrist, q = wrists[row].copy(), opened[row].copy()
-        start = wrists[row]
+        start = wrists[row].copy()
         touching[:] = False
         speed[:] = 0.0
         weight[:] = 0.0
         command = opened[row].copy()
-        for step in range(CLOSING_STEPS + SETTLING_STEPS):
-            share = min(1.0, (step + 1) / CLOSING_STEPS)
+        for step in range(steps.closing + steps.settling):
+            share = min(1.0, (step + 1) / steps.closing)
             for j in range(joints):
                 command[j] = opened[row, j] + share * (squeezed[row, j] - opened[row, j])
             _forward(hand, wrist, q, 0.0, angles, poses)
@@ -176,9 +201,10 @@ def _hold(hand, field, drives, center, numbers, directions, wrists, opened, sque
             first[i] = _object(wrist, i)
             result[row, 0] += (first[i] - _object(start, i)) ** 2
         result[row, 0] = math.sqrt(result[row, 0])
+        settled_wrist, settled_joints = wrist.copy(), q.copy()
         farthest = 0.0
         for d in range(len(directions)):
-            for step in range(WEIGHT_STEPS):
+            for step in range(steps.weight):
                 if farthest < LOST:
                     for i in range(3):
                         weight[i] = 0.0
@@ -211,6 +237,7 @@ def _hold(hand, field, drives, center, numbers, directions, wrists, opened, sque
                         moved += (_object(wrist, i) - first[i]) ** 2
                     farthest = max(farthest, math.sqrt(moved))
             result[row, 2 + d] = farthest
+        wrists[row], opened[row] = settled_wrist, settled_joints
     return result
 
 
@@ -281,6 +308,7 @@ def _relax(
             here,
             (k * t[0] - normal * n[0], k * t[1] - normal * n[1], k * t[2] - normal * n[2]),
         )
+    _self_penetration(hand, 0.0, STIFFNESS, poses, wrench)
     _push(wrench, 0, (0.0, 0.0, 0.0), weight)
     _pull_back(hand, poses, wrench, gradient)
     for j in range(len(q)):

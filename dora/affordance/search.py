@@ -115,6 +115,8 @@ TOLERANCE = 1e-4
 """Sum of overlaps (m) that a settled row may have, skin included."""
 MEAN_DECAY, SQUARE_DECAY = 0.9, 0.98
 """Adam's decay rates."""
+POLISH_STEP = 0.3
+"""Largest steps of polishing, in those of the search."""
 LAST_STEP = 0.01
 """Share of the step sizes that is left at the end of the cosine schedule."""
 
@@ -190,7 +192,7 @@ class Search:
         found = self.energy(rows.wrist, rows.joints, rows.contacts, ramp)
         if step and step % settings.resample == 0 and done < settings.resample_until:
             found = self._resample(rows, found, ramp, generator)
-        self.descend(rows, found, step)
+        self.descend(rows, found, step, done)
         return found
 
     def _resample(self, rows: Rows, found: Evaluation, ramp: float, generator: torch.Generator) -> Evaluation:
@@ -208,14 +210,37 @@ class Search:
             torch.where(better.unsqueeze(1), other.joints, found.joints),
         )
 
-    def descend(self, rows: Rows, found: Evaluation, step: int) -> None:
-        """One Adam step with a cosine schedule; rotations move along their tangent."""
+    def polish(self, rows: Rows, iterations: int) -> Rows:
+        """Descend from where rows are, full weights on overlaps, with the points that are nearest as contacts."""
+        settings, hand = self.settings, self.energy.hand
+        rows = Rows.begin(rows.wrist, rows.joints, self.nearest_contacts(rows), rows.total)
+        for step in range(iterations):
+            found = self.energy(rows.wrist, rows.joints, rows.contacts, settings.ramp)
+            self.descend(rows, found, step, step / iterations, POLISH_STEP)
+        rows.joints = torch.clamp(rows.joints, hand.lower, hand.upper)
+        return rows
+
+    def nearest_contacts(self, rows: Rows) -> Int[Tensor, "c k"]:
+        """The nearest point of the palm, and of the nearest of the other links."""
+        hand = self.energy.hand
+        points = hand.place(hand.forward(rows.wrist, rows.joints), hand.contacts)
+        distance = self.energy.field.distance(points).abs()
+        counts = torch.unique_consecutive(hand.contacts.body, return_counts=True)[1]
+        starts = counts.cumsum(0) - counts
+        found = [part.min(1) for part in distance.split(counts.tolist(), 1)]
+        index = torch.stack([part.indices for part in found], 1) + starts
+        gap = torch.stack([part.values for part in found], 1)
+        gap[:, 0] = -1.0
+        return torch.take_along_dim(index, gap.argsort(1)[:, : self.settings.contacts], 1)
+
+    def descend(self, rows: Rows, found: Evaluation, step: int, done: float, scale: float = 1.0) -> None:
+        """One Adam step with a cosine schedule in the share `done`; rotations move along their tangent."""
         gradient = torch.cat((found.wrist, found.joints), 1)
         rows.mean.lerp_(gradient, 1 - MEAN_DECAY)
         rows.square.lerp_(gradient.square(), 1 - SQUARE_DECAY)
         mean = rows.mean / (1 - MEAN_DECAY ** (step + 1))
         root = (rows.square / (1 - SQUARE_DECAY ** (step + 1))).sqrt_().add_(1e-8)
-        size = LAST_STEP + (1 - LAST_STEP) * 0.5 * (1 + math.cos(math.pi * step / self.settings.iterations))
+        size = scale * (LAST_STEP + (1 - LAST_STEP) * 0.5 * (1 + math.cos(math.pi * done)))
         move = -size * self._steps * mean / root
         rows.wrist[:, :3, 3] += move[:, :3]
         half = torch.nn.functional.pad(0.5 * move[:, 3:6], (1, 0), value=1.0)

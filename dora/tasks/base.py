@@ -42,6 +42,14 @@ class DoraEnv(BuiltEnv):
             return self.reach_table.mask(object_p, object_q)
         return torch.ones(len(object_p), len(self.guide.choice.candidates), dtype=torch.bool, device=self.device)
 
+    def first_reachable(
+        self, position: Float[Tensor, "b t 3"], quaternion: Float[Tensor, "b t 4"]
+    ) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 4"]]:
+        """Of t drawn object poses, the first one that leaves a reachable candidate; the very first if none does."""
+        able = self.reachable(position.flatten(0, 1), quaternion.flatten(0, 1)).any(-1).reshape(position.shape[:2])
+        chosen = torch.arange(len(position), device=position.device), able.float().argmax(-1)
+        return position[chosen], quaternion[chosen]
+
     def extended(self, s: Snapshot) -> Snapshot:
         """The snapshot with what this task reads in addition: a subclass of `Snapshot`."""
         return s
@@ -114,7 +122,8 @@ class DoraEnv(BuiltEnv):
         """Gives new episodes their candidates and starts their references."""
         wrist_p, wrist_q = (x.expand(len(env_idx), -1) for x in self._home)
         choice, reachable = self.guide.choice, self.reachable(object_p, object_q)
-        wanted = reachable if FILTER in self.parts else torch.ones_like(reachable)
+        # Without guidance only the scripted solution uses candidates.
+        wanted = reachable if FILTER in self.parts or not self.parts else torch.ones_like(reachable)
         wanted = wanted if self.narrow is None else self.narrow(wanted)
         index = choice.nearest(object_p, object_q, wrist_p, wrist_q, wanted)
         choice.choose(env_idx, index, reachable.any(-1), error, self.preset)

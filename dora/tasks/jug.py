@@ -316,9 +316,7 @@ class JugEnv(DoraEnv):
         turn = torch.zeros_like(position)
         turn[..., 2] = 2 * pi * u[..., 2]
         quaternion = quaternion_from_rotation_vector(turn)
-        able = self.reachable(position.flatten(0, 1), quaternion.flatten(0, 1)).any(-1).reshape(-1, TRIES)
-        chosen = torch.arange(len(u), device=self.device), able.float().argmax(-1)
-        self.target_object.set_pose(Pose.create_from_pq(position[chosen], quaternion[chosen]))
+        self.target_object.set_pose(Pose.create_from_pq(*self.first_reachable(position, quaternion)))
 
     def failed(self, s: Snapshot) -> Bool[Tensor, " n"]:
         """Also when the jug has tipped over, or stands on the table again after it was lifted."""
