@@ -166,7 +166,8 @@ PAPER_TERMS: Terms[Snapshot] = Terms(
 class CubeEnv(DoraEnv):
     """Grasp a cube on a table with the five-fingered hand and lift it.
 
-    **Randomisations:** position within +-8 cm and any yaw that leaves a stored candidate within the arm's reach; size, mass, friction and candidate error by preset.
+    **Randomisations:** position within +-8 cm and yaw, wherever the arm can carry out at least one stored candidate;
+    size, mass, friction, candidate error, observation noise, delay and pushes by preset.
 
     **Stages:** reach (thumb and one fingertip within 3 cm of the cube), grasp (thumb and one more finger touch it for
     3 steps), lift (>= 10 cm above its start, held by thumb and one more finger, off the table, for 10 steps).
