@@ -187,7 +187,8 @@ def test_bad_parts_are_refused(options: dict):
 def test_a_start_without_a_reachable_candidate_fails_and_earns_nothing(parts: tuple[str, ...] | None):
     task = tasks.make_task("DoraCube-v1", 3, guidance_parts=parts)
     able = torch.tensor([[True], [False], [True]])
-    task.reachable = lambda p, q: able[: len(p)].expand(-1, 4)  # type: ignore[method-assign]
+    count = len(task.guide.choice.candidates)
+    task.reachable = lambda p, q: able.repeat_interleave(len(p) // 3, 0).expand(-1, count)  # type: ignore[method-assign]
     task.reset(seed=0)
     _, reward, terminated, _, info = task.step(torch.zeros(3, task.action_size))
     filtered = parts is None

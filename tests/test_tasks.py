@@ -123,7 +123,7 @@ def test_state_round_trip_restores_stage_observation_and_future(batch: DoraEnv):
     batch.step(batch.scripted_action())
     # PhysX forgets contacts, so an object with a wide foot settles anew after a restoration.
     torch.testing.assert_close(batch.snapshot.object_p, after.object_p, atol=1.5e-3, rtol=0)
-    torch.testing.assert_close(batch.snapshot.hand_q, after.hand_q, atol=2e-3, rtol=0)
+    torch.testing.assert_close(batch.snapshot.hand_q, after.hand_q, atol=4e-3, rtol=0)
 
 
 @pytest.mark.parametrize("which", [[2], [0, 1, 3, 4, 5]])

@@ -60,13 +60,13 @@ class _Hand(NamedTuple):
 
 
 class _Field(NamedTuple):
-    """Arrays of `SignedDistanceField`: all channels, the distance alone, nodes per axis, first node, spacing (m)."""
+    """Arrays of `SignedDistanceField`: all channels, distance, nodes per axis, first node, nodes per metre, cull (m)."""
 
     table: np.ndarray
     distance: np.ndarray
     shape: tuple[int, int, int]
     lower: tuple[float, float, float]
-    spacing: float
+    inverse: float
     cull: float
 
 
@@ -82,8 +82,7 @@ class CompiledEnergy(GraspEnergy):
     ) -> Evaluation:
         """As `GraspEnergy`."""
         weights = np.array([getattr(self.weights, name) * (ramp if name in RAMPED else 1.0) for name in TERMS])
-        normal, offset = ((0.0, 0.0, 0.0), math.inf) if self.table is None else (self.table.normal, self.table.offset)
-        plane = np.array([*normal, offset])
+        plane = self.plane()
         terms, gradient = _evaluate(
             self.arrays(), self.field_arrays(), weights, plane, wrist.numpy(), joints.numpy(), contacts.numpy()
         )
@@ -98,6 +97,11 @@ class CompiledEnergy(GraspEnergy):
         return Evaluation(
             total, {name: value[:, TERMS.index(name)] for name in names}, gradients[:, :6], gradients[:, 6:]
         )
+
+    def plane(self) -> np.ndarray:
+        """Normal and offset (m) of the table, for compiled functions; infinitely far if there is none."""
+        normal, offset = ((0.0, 0.0, 0.0), math.inf) if self.table is None else (self.table.normal, self.table.offset)
+        return np.array([*normal, offset])
 
     @cache  # noqa: B019
     def field_arrays(self) -> _Field:
@@ -146,7 +150,7 @@ def _field_arrays(field: SignedDistanceField) -> _Field:
         distance=np.ascontiguousarray(table[:, :1]),
         shape=field.shape,
         lower=tuple(field.lower.tolist()),
-        spacing=field.spacing,
+        inverse=1 / field.spacing,
         cull=CULL * field.spacing,
     )
 
@@ -230,35 +234,35 @@ def _push(wrench, body, point, force):
 
 
 @njit(cache=True, error_model="numpy")
-def _nearest(position, lower, spacing, count):
+def _nearest(position, lower, inverse, count):
     """Index of the nearest node along one axis."""
-    return int(min(max((position - lower) / spacing + 0.5, 0.0), count - 0.5))
+    return int(min(max((position - lower) * inverse + 0.5, 0.0), count - 0.5))
 
 
 @njit(cache=True, error_model="numpy")
-def _near(field, point, reach):
-    """Whether the interpolated distance at a point may be below a reach (m), by the nearest node."""
-    i = _nearest(point[0], field.lower[0], field.spacing, field.shape[0])
-    j = _nearest(point[1], field.lower[1], field.spacing, field.shape[1])
-    k = _nearest(point[2], field.lower[2], field.spacing, field.shape[2])
-    return field.distance[(i * field.shape[1] + j) * field.shape[2] + k, 0] < reach + field.cull
+def _coarse(field, point):
+    """Distance (m) at the node nearest to a point."""
+    i = _nearest(point[0], field.lower[0], field.inverse, field.shape[0])
+    j = _nearest(point[1], field.lower[1], field.inverse, field.shape[1])
+    k = _nearest(point[2], field.lower[2], field.inverse, field.shape[2])
+    return field.distance[(i * field.shape[1] + j) * field.shape[2] + k, 0]
 
 
 @njit(cache=True, error_model="numpy")
-def _along(position, lower, spacing, count):
+def _along(position, lower, inverse, count):
     """Along one axis: first node of the cell, share of the cell passed, distance (m) beyond the grid."""
-    place = (position - lower) / spacing
+    place = (position - lower) * inverse
     inside = min(max(place, 0.0), count - 1.0)
     base = min(int(inside), count - 2)
-    return base, inside - base, (place - inside) * spacing
+    return base, inside - base, (place - inside) / inverse
 
 
 @njit(cache=True, error_model="numpy")
 def _sample(field, table, point, value, slope):
     """As `SignedDistanceField.sample`: interpolated channels of a table and their derivatives (per m)."""
-    i, x, outside_x = _along(point[0], field.lower[0], field.spacing, field.shape[0])
-    j, y, outside_y = _along(point[1], field.lower[1], field.spacing, field.shape[1])
-    k, z, outside_z = _along(point[2], field.lower[2], field.spacing, field.shape[2])
+    i, x, outside_x = _along(point[0], field.lower[0], field.inverse, field.shape[0])
+    j, y, outside_y = _along(point[1], field.lower[1], field.inverse, field.shape[1])
+    k, z, outside_z = _along(point[2], field.lower[2], field.inverse, field.shape[2])
     outside = (outside_x, outside_y, outside_z)
     distant = math.sqrt(outside_x**2 + outside_y**2 + outside_z**2)
     row, plane = field.shape[2], field.shape[1] * field.shape[2]
@@ -274,9 +278,9 @@ def _sample(field, table, point, value, slope):
         v0, v1 = v00 + y * (v10 - v00), v01 + y * (v11 - v01)
         value[c] = v0 + z * (v1 - v0)
         d0, d1 = d00 + y * (d10 - d00), d01 + y * (d11 - d01)
-        slope[c, 0] = (d0 + z * (d1 - d0)) / field.spacing
-        slope[c, 1] = ((v10 - v00) + z * ((v11 - v01) - (v10 - v00))) / field.spacing
-        slope[c, 2] = (v1 - v0) / field.spacing
+        slope[c, 0] = (d0 + z * (d1 - d0)) * field.inverse
+        slope[c, 1] = ((v10 - v00) + z * ((v11 - v01) - (v10 - v00))) * field.inverse
+        slope[c, 2] = (v1 - v0) * field.inverse
         if distant > 0.0:
             for axis in range(3):
                 if outside[axis] != 0.0:
@@ -367,7 +371,7 @@ def _sphere_terms(hand, field, weights, plane, poses, value, slope, terms, wrenc
     for s in range(len(hand.sphere_body)):
         body = hand.sphere_body[s]
         point = _point(poses, body, hand.sphere_local, s)
-        if _near(field, point, hand.sphere_reach[s]):
+        if _coarse(field, point) < hand.sphere_reach[s] + field.cull:
             _sample(field, field.distance, point, value, slope)
             depth = hand.sphere_reach[s] - value[0]
             if depth > 0.0:

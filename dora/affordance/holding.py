@@ -19,9 +19,9 @@ from torch import Tensor
 
 from dora.affordance.compiled import (
     CompiledEnergy,
+    _coarse,
     _cross,
     _forward,
-    _near,
     _point,
     _pull_back,
     _push,
@@ -35,6 +35,10 @@ STIFFNESS = 4e3
 MOMENTUM = 0.7
 LARGEST_STEP = 3e-3
 """Largest step of the object (m, and in units of `ARM` rad) and of the fingers."""
+SAFETY = 2.0
+"""Weight in the model over that of the object: few steps of descent then tell what slips."""
+APPROACH = 6e-3
+"""Distance (m) that a sphere comes nearer to the object in one step at most; those far away wait."""
 ARM = 0.04
 """Typical distance (m) of contacts from the middle of the grip."""
 SPARE = 5.0
@@ -75,9 +79,13 @@ class Holding(NamedTuple):
 class Steps(NamedTuple):
     """Steps of descent: while the command moves, until the grip rests, and for every direction of the weight."""
 
-    closing: int = 100
-    settling: int = 50
-    weight: int = 50
+    closing: int = 60
+    settling: int = 20
+    weight: int = 20
+
+
+STEPS = Steps()
+"""Steps that judge a candidate."""
 
 
 class _Drives(NamedTuple):
@@ -93,7 +101,8 @@ def hold(
     squeezed: Float[Tensor, "c j"],
     mass: float,
     protocol: Protocol = STANDARD,
-    steps: Steps = Steps(),
+    steps: Steps = STEPS,
+    on_table: bool = False,
 ) -> Holding:
     """Close and load every candidate.
 
@@ -104,6 +113,8 @@ def hold(
         squeezed: command of all hand joints.
         mass: of the object (kg).
         protocol: has friction, gravity.
+        steps: of the model.
+        on_table: whether the hand stays above the energy's table.
     """
     hand, robot = energy.hand, energy.hand.robot.hand
     arrays = energy.arrays()
@@ -119,7 +130,7 @@ def hold(
         1 / (robot.stiffness[index] + FINGER_CONTACTS * STIFFNESS * lever**2),
     )
     center = torch.as_tensor(hand.grip.center + ARM * hand.grip.normal).double().numpy()
-    numbers = np.array([mass * protocol.gravity, protocol.friction])
+    numbers = np.array([SAFETY * mass * protocol.gravity, protocol.friction])
     end, final = wrist.double().numpy().copy(), opened[:, order].double().numpy()
     result = _hold(
         free,
@@ -128,6 +139,7 @@ def hold(
         drives,
         center,
         numbers,
+        energy.plane() if on_table else np.array([0.0, 0.0, 0.0, np.inf]),
         np.array(DIRECTIONS),
         end,
         final,
@@ -155,19 +167,21 @@ def _levers(hand) -> np.ndarray:
 
 
 @njit(cache=True, error_model="numpy")
-def _hold(hand, steps, field, drives, center, numbers, directions, wrists, opened, squeezed):
+def _hold(hand, steps, field, drives, center, numbers, plane, directions, wrists, opened, squeezed):
     count, joints = opened.shape
     bodies, spheres = joints + 1, len(hand.sphere_body)
     result = np.zeros((count, 2 + len(directions)))
     angles, poses, wrench = np.zeros(joints), np.zeros((bodies, 3, 4)), np.zeros((bodies, 6))
     value, slope = np.zeros(1), np.zeros((1, 3))
-    local, anchor, touching = np.zeros((spheres, 3)), np.zeros((spheres, 3)), np.zeros(spheres, np.bool_)
+    local, anchor = np.zeros((spheres, 3)), np.zeros((spheres, 3))
+    touching, wait = np.zeros(spheres, np.bool_), np.zeros(spheres, np.int64)
     gradient, speed = np.zeros(6 + joints), np.zeros(6 + joints)
     weight, first = np.zeros(3), np.zeros(3)
     for row in range(count):
         wrist, q = wrists[row].copy(), opened[row].copy()
         start = wrists[row].copy()
         touching[:] = False
+        wait[:] = 0
         speed[:] = 0.0
         weight[:] = 0.0
         command = opened[row].copy()
@@ -182,6 +196,7 @@ def _hold(hand, steps, field, drives, center, numbers, directions, wrists, opene
                 drives,
                 center,
                 numbers[1],
+                plane,
                 weight,
                 wrist,
                 q,
@@ -193,6 +208,7 @@ def _hold(hand, steps, field, drives, center, numbers, directions, wrists, opene
                 local,
                 anchor,
                 touching,
+                wait,
                 gradient,
                 speed,
             )
@@ -204,7 +220,7 @@ def _hold(hand, steps, field, drives, center, numbers, directions, wrists, opene
         settled_wrist, settled_joints = wrist.copy(), q.copy()
         farthest = 0.0
         for d in range(len(directions)):
-            for step in range(steps.weight):
+            for _ in range(steps.weight):
                 if farthest < LOST:
                     for i in range(3):
                         weight[i] = 0.0
@@ -218,6 +234,7 @@ def _hold(hand, steps, field, drives, center, numbers, directions, wrists, opene
                         drives,
                         center,
                         numbers[1],
+                        plane,
                         weight,
                         wrist,
                         q,
@@ -229,6 +246,7 @@ def _hold(hand, steps, field, drives, center, numbers, directions, wrists, opene
                         local,
                         anchor,
                         touching,
+                        wait,
                         gradient,
                         speed,
                     )
@@ -254,6 +272,7 @@ def _relax(
     drives,
     center,
     friction,
+    plane,
     weight,
     wrist,
     q,
@@ -265,6 +284,7 @@ def _relax(
     local,
     anchor,
     touching,
+    wait,
     gradient,
     speed,
 ):
@@ -273,10 +293,17 @@ def _relax(
     gradient[:] = 0.0
     total, contacts = 0.0, SPARE
     for s in range(len(hand.sphere_body)):
+        if plane[3] < np.inf:
+            _rest_on(hand, plane, poses, s, wrench)
+        if wait[s] > 0:
+            wait[s] -= 1
+            continue
         body, radius = hand.sphere_body[s], hand.sphere_radius[s]
         point = _point(poses, body, hand.sphere_local, s)
-        if not _near(field, point, radius):
+        beyond = _coarse(field, point) - radius - field.cull
+        if beyond > 0.0:
             touching[s] = False
+            wait[s] = int(beyond / APPROACH)
             continue
         _sample(field, field.distance, point, value, slope)
         depth = radius - value[0]
@@ -319,6 +346,18 @@ def _relax(
         q[j] = min(max(q[j] + min(max(speed[6 + j], -0.05), 0.05), hand.lower[j]), hand.upper[j])
     _move(wrist, center, contacts * STIFFNESS, gradient, speed)
     return total
+
+
+@njit(cache=True, error_model="numpy")
+def _rest_on(hand, plane, poses, s, wrench):
+    """The table pushes a sphere out."""
+    body = hand.sphere_body[s]
+    point = _point(poses, body, hand.sphere_local, s)
+    height = plane[0] * point[0] + plane[1] * point[1] + plane[2] * point[2] + plane[3]
+    depth = hand.sphere_radius[s] - height
+    if depth > 0.0:
+        push = -STIFFNESS * depth
+        _push(wrench, body, point, (push * plane[0], push * plane[1], push * plane[2]))
 
 
 @njit(cache=True, error_model="numpy")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from dora.affordance.compiled import CompiledEnergy
 from dora.affordance.contact_map import hand_contacts
 from dora.affordance.energies import GraspEnergy, Table
 from dora.affordance.hand import HandModel
-from dora.affordance.holding import hold
+from dora.affordance.holding import Steps, hold
 from dora.affordance.initial import InitialPoses
 from dora.affordance.map import AffordanceMap
 from dora.affordance.measures import Penetration, self_penetration
@@ -38,8 +39,10 @@ OPENINGS = (0.25, 0.5, 0.75, 1.0)
 """Shares of the protocol's opening that are tried."""
 OPENING_DEPTH = 1e-3
 """Overlap (m) with the object up to which a finger counts as clear of it."""
-CHECKED = 1.25
-"""Candidates whose penetration is measured exactly, per candidate wanted."""
+SEATING = Steps(closing=60, settling=20, weight=0)
+"""Steps of the hand that closes around the object."""
+SHALLOW = 1e-3
+"""Penetration (m) that is better not exceeded."""
 NO_CLASS = "NoContact"
 """Grasp class of a candidate without contact."""
 
@@ -93,7 +96,13 @@ def optimise(
             progress(done, total)
 
     found = [
-        search.run(size, torch.Generator().manual_seed(batch_seed(seed, index)), report)
+        _seated(
+            energy,
+            search,
+            search.run(size, torch.Generator().manual_seed(batch_seed(seed, index)), report),
+            obj.mass,
+            settings,
+        )
         for index, size in enumerate(sizes)
     ]
     return _candidates(obj, energy, Rows.join(found), num, settings)
@@ -116,15 +125,14 @@ def _candidates(
     """The `num` best rows, measured and classified."""
     hand, robot = energy.hand, energy.hand.robot
     found = energy(rows.wrist, rows.joints, rows.contacts, settings.ramp)
-    quality, predicted = _quality(obj, energy, rows, found.total)
-    likely = quality.argsort(descending=True)[: math.ceil(CHECKED * num)]
-    poses = hand.forward(rows.wrist[likely], rows.joints[likely])
+    poses = hand.forward(rows.wrist, rows.joints)
     depth, self_depth = Penetration(hand, energy.field)(poses), self_penetration(energy, poses)
-    invalid = (depth > STANDARD.penetration).long()
-    crossed = (self_depth > STANDARD.strict_self_penetration).long()
-    order = (2 * invalid + crossed).argsort(stable=True)[:num]
-    best = likely[order]
-    poses, joints, wrist = poses[order], rows.joints[best], rows.wrist[best]
+    faults = 4 * (depth > STANDARD.penetration).long() + 2 * (self_depth > STANDARD.strict_self_penetration).long()
+    faults += (depth > SHALLOW).long()
+    quality, predicted = _quality(obj, energy, rows, found.total, faults.argsort(stable=True)[: _judged(faults, num)])
+    order = quality.argsort(descending=True)
+    best = order[faults[order].argsort(stable=True)][:num]
+    poses, joints, wrist = poses[best], rows.joints[best], rows.wrist[best]
     points, finger = hand_contacts(hand, energy.field, poses)
     held = vote(AffordanceMap.from_object(obj).to(points.device), points, finger)
     full = robot.expand_hand(joints)
@@ -141,9 +149,9 @@ def _candidates(
         contacts=points,
         contact_finger=finger,
         energy={name: value[best] for name, value in (found.terms | predicted).items()},
-        penetration=depth[order],
-        self_penetration=self_depth[order],
-        valid=invalid[order] == 0,
+        penetration=depth[best],
+        self_penetration=self_depth[best],
+        valid=depth[best] <= STANDARD.penetration,
         digest=obj.digest,
         robot=robot.name,
         robot_digest=hand_digest(robot),
@@ -151,18 +159,42 @@ def _candidates(
     )
 
 
-def _quality(obj: AffordanceObject, energy: GraspEnergy, rows: Rows, total: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """What candidates are ranked by (c,), more is better, and the predictions it is made of."""
+def _judged(faults: Tensor, num: int) -> int:
+    """How many rows are worth judging: all without fault, but at least as many as are wanted."""
+    return max(num, int((faults < 2).sum()))
+
+
+def _quality(
+    obj: AffordanceObject, energy: GraspEnergy, rows: Rows, total: Tensor, judged: Tensor
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """What candidates are ranked by (c,), more is better, and the predictions it is made of, for the rows judged."""
     if not isinstance(energy, CompiledEnergy):
         return -total, {}
     robot = energy.hand.robot
-    full = robot.expand_hand(rows.joints)
-    held = hold(energy, rows.wrist, pregrasp(robot, full), squeeze(robot, full), obj.mass)
-    return held.quality, {
-        "predicted_shift": held.shift,
-        "predicted_displacement": held.displacement[:, -1],
-        "predicted_force": held.force,
+    full = robot.expand_hand(rows.joints[judged])
+    held = hold(energy, rows.wrist[judged], pregrasp(robot, full), squeeze(robot, full), obj.mass)
+
+    def spread(values: Tensor, missing: float) -> Tensor:
+        return torch.full_like(total, missing).index_copy_(0, judged, values)
+
+    predictions = {
+        "predicted_shift": spread(held.shift, math.nan),
+        "predicted_displacement": spread(held.displacement[:, -1], math.nan),
+        "predicted_force": spread(held.force, math.nan),
     }
+    return spread(held.quality, -math.inf), predictions
+
+
+def _seated(energy: GraspEnergy, search: Search, rows: Rows, mass: float, settings: Settings) -> Rows:
+    """Rows after their hands have closed around the object, overlaps removed; what a squeeze then adds is force."""
+    if not settings.seat or not isinstance(energy, CompiledEnergy):
+        return rows
+    robot = energy.hand.robot
+    full = robot.expand_hand(rows.joints)
+    closed = squeeze(robot, full, replace(STANDARD, squeeze=settings.seat))
+    held = hold(energy, rows.wrist, pregrasp(robot, full), closed, mass, steps=SEATING, on_table=True)
+    rows.wrist, rows.joints = held.wrist.contiguous(), robot.reduce_hand(held.joints)
+    return search.polish(rows, settings.polish)
 
 
 def opened(energy: GraspEnergy, wrist: Float[Tensor, "c 4 4"], joints: Float[Tensor, "c j"]) -> Float[Tensor, "c j"]:

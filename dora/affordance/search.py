@@ -40,6 +40,8 @@ class Settings:
         halving: see `field_size`.
         settle: share of the iterations after which rows that have converged stop.
         oversampling: candidates finished per candidate asked for; the best are returned.
+        seat: how far the hand then closes around the object (rad), for contacts that are not made yet; 0: not at all.
+        polish: gradient steps that remove overlaps after that.
         translation: largest step of the wrist (m).
         rotation: largest rotation of the wrist in a step (rad).
         joint: largest step of a joint (rad).
@@ -48,7 +50,7 @@ class Settings:
         spread: of the initial poses.
     """
 
-    iterations: int = 200
+    iterations: int = 70
     contacts: int = 9
     weights: Weights = field(default_factory=Weights)
     ramp: float = 12.0
@@ -56,10 +58,12 @@ class Settings:
     resample: int = 20
     resample_until: float = 0.6
     starts: int = 6
-    field_size: float = 3.0
+    field_size: float = 2.0
     halving: float = 0.25
     settle: float = 0.6
-    oversampling: float = 1.5
+    oversampling: float = 2.5
+    seat: float = 0.7
+    polish: int = 40
     translation: float = 2e-3
     rotation: float = 0.02
     joint: float = 0.02
@@ -115,7 +119,7 @@ TOLERANCE = 1e-4
 """Sum of overlaps (m) that a settled row may have, skin included."""
 MEAN_DECAY, SQUARE_DECAY = 0.9, 0.98
 """Adam's decay rates."""
-POLISH_STEP = 0.3
+POLISH_STEP = 0.5
 """Largest steps of polishing, in those of the search."""
 LAST_STEP = 0.01
 """Share of the step sizes that is left at the end of the cosine schedule."""
@@ -211,7 +215,7 @@ class Search:
         )
 
     def polish(self, rows: Rows, iterations: int) -> Rows:
-        """Descend from where rows are, full weights on overlaps, with the points that are nearest as contacts."""
+        """Descend from where rows are: full weights on overlaps, the nearest points as contacts."""
         settings, hand = self.settings, self.energy.hand
         rows = Rows.begin(rows.wrist, rows.joints, self.nearest_contacts(rows), rows.total)
         for step in range(iterations):
