@@ -7,6 +7,7 @@ import pytest
 import torch
 import trimesh
 
+from dora.affordance.compiled import CompiledEnergy
 from dora.affordance.energies import (
     LENGTH,
     TERMS,
@@ -193,3 +194,22 @@ def test_nearest_points_of_segments():
 
 def test_weights_can_be_changed_one_by_one():
     assert replace(Weights(), closure=0.0).closure == 0
+
+
+@pytest.mark.parametrize("with_table", [True, False])
+def test_compiled_energy_equals_the_definition(with_table):
+    single = HandModel(load_robot("diana7_hit"))
+    box = trimesh.creation.box((0.05, 0.06, 0.07))
+    table = Table((0.0, 0.6, 0.8), 0.01) if with_table else None
+    region = trimesh.Trimesh(box.vertices, box.faces[:2]) if with_table else None
+    field = SignedDistanceField(box, region)
+    wrist, joints, contacts = draw(single)
+    arguments = wrist.float(), joints.float(), contacts, 3.0
+    expected = GraspEnergy(single, field, table=table)(*arguments)
+    found = CompiledEnergy(single, field, table=table)(*arguments)
+    assert set(found.terms) == set(expected.terms)
+    for name, value in expected.terms.items():
+        torch.testing.assert_close(found.terms[name], value, rtol=1e-4, atol=1e-5, msg=name)
+    for name in ("total", "wrist", "joints"):
+        scale = float(getattr(expected, name).abs().max())
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-3, atol=1e-4 * scale)

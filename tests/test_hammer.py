@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import fields
 from math import pi
 
-import numpy as np
 import pytest
 import sapien
 import torch
@@ -281,7 +280,7 @@ def test_leaning_and_pushing_do_not_count(bench: hammer.HammerEnv):
     push = [0.0]
 
     def lean(_: int) -> None:
-        body.add_force_at_point(np.array([0.0, 0.0, -push[0]]), body.entity_pose.p)
+        body.add_force_at_point([0.0, 0.0, -push[0]], body.entity_pose.p)
 
     watch_physics(bench.scene, lean)
     push[0] = 20.0

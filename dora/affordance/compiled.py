@@ -6,7 +6,9 @@ takes a fraction of the time. `GraspEnergy` stays the definition; a test holds t
 
 from __future__ import annotations
 
+import inspect
 import math
+from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
@@ -30,6 +32,11 @@ from dora.affordance.signed_distance import CHANNELS, CULL, SignedDistanceField
 
 _SMALL = 1e-9
 _CLOSURE, _DISTANCE, _REGION, _CLOSING, _PENETRATION, _TABLE, _LIMITS, _SELF = range(len(TERMS))
+
+
+def native(function: Callable) -> Callable:
+    """A function compiled by Numba, kept on disk; type checks that were put around it are left out."""
+    return njit(cache=True, error_model="numpy")(inspect.unwrap(function))
 
 
 class _Hand(NamedTuple):
@@ -60,7 +67,7 @@ class _Hand(NamedTuple):
 
 
 class _Field(NamedTuple):
-    """Arrays of `SignedDistanceField`: all channels, distance, nodes per axis, first node, nodes per metre, cull (m)."""
+    """Arrays of `SignedDistanceField`: all channels, distance, nodes per axis, first node, nodes per m, cull (m)."""
 
     table: np.ndarray
     distance: np.ndarray
@@ -155,7 +162,7 @@ def _field_arrays(field: SignedDistanceField) -> _Field:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _evaluate(hand, field, weights, plane, wrist, joints, contacts):
     """Values of all terms (c, terms) and the gradient of their weighted sum (c, 6 + a)."""
     count, actuated = joints.shape
@@ -182,7 +189,7 @@ def _evaluate(hand, field, weights, plane, wrist, joints, contacts):
     return terms, gradient
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _forward(hand, wrist, joints, share, angles, poses):
     """Angles of all joints and poses (bodies, 3, 4) of a hand closed by a share of `close`."""
     for i in range(3):
@@ -208,7 +215,7 @@ def _forward(hand, wrist, joints, share, angles, poses):
                 poses[joint + 1, i, k] = total
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _point(poses, body, local, index):
     """A point of a body (m) in the frame of the poses."""
     x, y, z = local[index, 0], local[index, 1], local[index, 2]
@@ -219,12 +226,12 @@ def _point(poses, body, local, index):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _push(wrench, body, point, force):
     """Adds a force at a point, and its moment about the origin, to the wrench on a body."""
     moment = _cross(point, force)
@@ -233,13 +240,13 @@ def _push(wrench, body, point, force):
         wrench[body, 3 + i] += moment[i]
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _nearest(position, lower, inverse, count):
     """Index of the nearest node along one axis."""
     return int(min(max((position - lower) * inverse + 0.5, 0.0), count - 0.5))
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _coarse(field, point):
     """Distance (m) at the node nearest to a point."""
     i = _nearest(point[0], field.lower[0], field.inverse, field.shape[0])
@@ -248,7 +255,7 @@ def _coarse(field, point):
     return field.distance[(i * field.shape[1] + j) * field.shape[2] + k, 0]
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _along(position, lower, inverse, count):
     """Along one axis: first node of the cell, share of the cell passed, distance (m) beyond the grid."""
     place = (position - lower) * inverse
@@ -257,7 +264,7 @@ def _along(position, lower, inverse, count):
     return base, inside - base, (place - inside) / inverse
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _sample(field, table, point, value, slope):
     """As `SignedDistanceField.sample`: interpolated channels of a table and their derivatives (per m)."""
     i, x, outside_x = _along(point[0], field.lower[0], field.inverse, field.shape[0])
@@ -291,7 +298,7 @@ def _sample(field, table, point, value, slope):
                 value[c] += distant
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _contact_terms(hand, field, weights, poses, contacts, value, slope, terms, wrench):
     """closure, distance and region."""
     count = len(contacts)
@@ -349,7 +356,7 @@ def _contact_terms(hand, field, weights, poses, contacts, value, slope, terms, w
         _push(wrench, hand.contact_body[contacts[k]], points[k], by_point)
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _closing(hand, field, weight, poses, contacts, value, slope, wrench):
     total = 0.0
     for k in range(len(contacts)):
@@ -365,7 +372,7 @@ def _closing(hand, field, weight, poses, contacts, value, slope, wrench):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _sphere_terms(hand, field, weights, plane, poses, value, slope, terms, wrench):
     """penetration and table."""
     for s in range(len(hand.sphere_body)):
@@ -386,7 +393,7 @@ def _sphere_terms(hand, field, weights, plane, poses, value, slope, terms, wrenc
             _push(wrench, body, point, (w * plane[0], w * plane[1], w * plane[2]))
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _self_penetration(hand, weight, stiffness, poses, wrench):
     """Sum of overlaps (m); capsules part with a force of `weight` and of `stiffness` times the overlap."""
     capsules = len(hand.radius)
@@ -405,7 +412,7 @@ def _self_penetration(hand, weight, stiffness, poses, wrench):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _overlap(hand, weight, stiffness, a, b, ends, wrench):
     """Overlap (m) of two capsules, and the forces that part them."""
     uu = vv = ww = uv = uw = vw = 0.0
@@ -429,7 +436,7 @@ def _overlap(hand, weight, stiffness, a, b, ends, wrench):
     return limit - distance
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _between(ends, capsule, share):
     """A point on a capsule's axis."""
     a, b = 2 * capsule, 2 * capsule + 1
@@ -440,7 +447,7 @@ def _between(ends, capsule, share):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _limits(hand, weight, angles, gradient):
     total = 0.0
     for joint in range(len(angles)):
@@ -451,7 +458,7 @@ def _limits(hand, weight, angles, gradient):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _pull_back(hand, poses, wrench, gradient):
     """Adds the generalised forces of wrenches on the bodies to the gradient; as `HandModel.pull_back`."""
     total, beyond = wrench[0].copy(), np.empty(6)

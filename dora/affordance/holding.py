@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit
 from torch import Tensor
 
 from dora.affordance.compiled import (
@@ -27,6 +26,7 @@ from dora.affordance.compiled import (
     _push,
     _sample,
     _self_penetration,
+    native,
 )
 from dora.affordance.protocol import DIRECTIONS, STANDARD, Protocol
 
@@ -166,7 +166,7 @@ def _levers(hand) -> np.ndarray:
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _hold(hand, steps, field, drives, center, numbers, plane, directions, wrists, opened, squeezed):
     count, joints = opened.shape
     bodies, spheres = joints + 1, len(hand.sphere_body)
@@ -259,13 +259,13 @@ def _hold(hand, steps, field, drives, center, numbers, plane, directions, wrists
     return result
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _object(wrist, axis):
     """Position of the object's origin in the wrist's frame, along one axis."""
     return -(wrist[0, axis] * wrist[0, 3] + wrist[1, axis] * wrist[1, 3] + wrist[2, axis] * wrist[2, 3])
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _relax(
     hand,
     field,
@@ -348,7 +348,7 @@ def _relax(
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _rest_on(hand, plane, poses, s, wrench):
     """The table pushes a sphere out."""
     body = hand.sphere_body[s]
@@ -360,7 +360,7 @@ def _rest_on(hand, plane, poses, s, wrench):
         _push(wrench, body, point, (push * plane[0], push * plane[1], push * plane[2]))
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _hold_on(poses, body, point, n, radius, local, anchor, s):
     """A sphere begins to touch: its material point and the object's point there."""
     for i in range(3):
@@ -371,7 +371,7 @@ def _hold_on(poses, body, point, n, radius, local, anchor, s):
             local[s, k] += poses[body, i, k] * (anchor[s, i] - poses[body, i, 3])
 
 
-@njit(cache=True, error_model="numpy")
+@native
 def _move(wrist, center, stiffness, gradient, speed):
     """Moves the wrist, which is the object seen from the hand, by a step about the middle of the grip."""
     pivot, arm = np.empty(3), np.empty(3)

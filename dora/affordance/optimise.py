@@ -41,8 +41,6 @@ OPENING_DEPTH = 1e-3
 """Overlap (m) with the object up to which a finger counts as clear of it."""
 SEATING = Steps(closing=60, settling=20, weight=0)
 """Steps of the hand that closes around the object."""
-SHALLOW = 1e-3
-"""Penetration (m) that is better not exceeded."""
 NO_CLASS = "NoContact"
 """Grasp class of a candidate without contact."""
 
@@ -127,8 +125,7 @@ def _candidates(
     found = energy(rows.wrist, rows.joints, rows.contacts, settings.ramp)
     poses = hand.forward(rows.wrist, rows.joints)
     depth, self_depth = Penetration(hand, energy.field)(poses), self_penetration(energy, poses)
-    faults = 4 * (depth > STANDARD.penetration).long() + 2 * (self_depth > STANDARD.strict_self_penetration).long()
-    faults += (depth > SHALLOW).long()
+    faults = 2 * (depth > STANDARD.penetration).long() + (self_depth > STANDARD.strict_self_penetration).long()
     quality, predicted = _quality(obj, energy, rows, found.total, faults.argsort(stable=True)[: _judged(faults, num)])
     order = quality.argsort(descending=True)
     best = order[faults[order].argsort(stable=True)][:num]
@@ -161,7 +158,7 @@ def _candidates(
 
 def _judged(faults: Tensor, num: int) -> int:
     """How many rows are worth judging: all without fault, but at least as many as are wanted."""
-    return max(num, int((faults < 2).sum()))
+    return max(num, int((faults == 0).sum()))
 
 
 def _quality(

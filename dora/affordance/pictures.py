@@ -124,7 +124,7 @@ def _write(
     for axis, view, title in zip(axes, views, titles, strict=False):
         axis.imshow(view)
         axis.set_title(title, fontsize=9)
-    patches = [Patch(color=tuple(value / 255 for value in colour), label=label) for label, colour in legend.items()]
+    patches = [Patch(color=np.divide(colour, 255).tolist(), label=label) for label, colour in legend.items()]
     figure.legend(
         handles=patches, loc="outside lower center", ncols=len(patches), fontsize=9, frameon=False, title=name
     )

@@ -147,7 +147,7 @@ class ReachTable:
         nodes, count = grid.nodes(), max(1, CHUNK // len(candidates))
         found = []
         for part in nodes.split(count):
-            position, quaternion = _poses(part, height, rest)
+            position, quaternion = poses(part, height, rest)
             found.append(reach.filter(candidates, position, quaternion).reason)
             if progress is not None:
                 progress(sum(map(len, found)), len(nodes))
@@ -217,7 +217,7 @@ def table_digest(
     return digest.hexdigest()
 
 
-def _poses(
+def poses(
     nodes: Float[Tensor, "m 3"], height: float, rest: tuple[float, float, float, float]
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:
     """World poses of an object at the nodes."""

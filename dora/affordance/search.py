@@ -63,7 +63,7 @@ class Settings:
     settle: float = 0.6
     oversampling: float = 2.5
     seat: float = 0.7
-    polish: int = 40
+    polish: int = 60
     translation: float = 2e-3
     rotation: float = 0.02
     joint: float = 0.02

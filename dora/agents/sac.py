@@ -142,7 +142,9 @@ def multi_step(batch: TensorDictBase, steps: int, gamma: float) -> TensorDict:
         total[:, :-k] += gamma**k * reward[:, k:] * more
         last[:, :-k] += more[..., 0]
         going[:, :-k] &= ~done[:, k:]
-    following = batch["next"].select("observation", "done", "terminated")[torch.arange(rows)[:, None], last]
+    each = torch.arange(rows)[:, None], last
+    names = ("observation", "done", "terminated")
+    following = TensorDict({name: batch["next", name][each] for name in names}, batch_size=batch.shape)
     return TensorDict(
         {
             "observation": batch["observation"].clone(),

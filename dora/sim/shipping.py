@@ -17,6 +17,7 @@ from dora.affordance.objects import load_object
 from dora.affordance.optimise import OFF_TABLE, Settings, optimise
 from dora.affordance.protocol import STANDARD
 from dora.affordance.reach import Reach
+from dora.affordance.reach_table import Grid, poses
 from dora.affordance.shipped import ROBOT, shipped_path
 from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
@@ -30,12 +31,18 @@ ROUND = 192
 """Candidates searched at a time for the target region."""
 MOST_ROUNDS = 12
 """Rounds after which a region has to have enough."""
-POOL = 128
+POOL = 240
 """Grasps of the target region that are ranked."""
 KEPT = 96
 """The best of them that are shipped."""
 FEWEST = 64
 """Grasps of the target region below which nothing is shipped."""
+STARTS = {"jug": "above"}
+"""Posture from which the arm sets out, where it is not "home"."""
+PLACES = Grid((0.55, 0.0), (0.08, 0.08), spacing=0.08, yaws=12)
+"""Where objects on a table may stand: a grasp has to be feasible somewhere."""
+FEASIBLE = 0.03
+"""Share of those places from which a grasp is kept."""
 OTHERS = 64
 """Candidates searched for each other region."""
 OTHERS_KEPT = 32
@@ -65,7 +72,7 @@ class SetMaker:
 
     def __init__(self, obj: AffordanceObject, robot: RobotDescription, phases: PhaseProgress) -> None:
         self.obj, self.robot, self.phases = obj, robot, phases
-        self.reach = Reach(robot, obj)
+        self.reach = Reach(robot, obj, start=STARTS.get(obj.name, "home"))
         self.on_table = obj.name not in OFF_TABLE
 
     def make(self, seed: int) -> GraspCandidates:
@@ -106,6 +113,11 @@ class SetMaker:
             if not free.any():
                 return None
             found = found.select(free)
+            places = poses(PLACES.nodes(), self.obj.support, self.obj.rest)
+            feasible = self.reach.filter(found, *places, exact=False).reachable.float().mean(0) >= FEASIBLE
+            if not feasible.any():
+                return None
+            found = found.select(feasible)
         verdict = validate(found, self.obj, self.robot, progress=self.phase(f"validate {label}"))
         return found.select(verdict.strict) if verdict.strict.any() else None
 

@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 from dora.errors import InputError
@@ -47,7 +48,7 @@ def record_demonstrations(
         raise InputError(f"demonstrations need at least one try in one environment, not {tries} in {num_envs}")
     options = {"obs_mode": "state", "reward_mode": "dense", "guidance": "none"} | options
     env = RecordEpisode(
-        gym.make(env_id, num_envs=num_envs, sim_backend="physx_cpu_batch", **options),
+        cast(BaseEnv, gym.make(env_id, num_envs=num_envs, sim_backend="physx_cpu_batch", **options)),
         str(folder),
         trajectory_name="demonstrations",
         save_on_reset=False,
