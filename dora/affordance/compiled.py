@@ -152,10 +152,11 @@ class CompiledEnergy(GraspEnergy):
 
 def _field_arrays(field: SignedDistanceField) -> _Field:
     table = np.ascontiguousarray(field.table.numpy())
+    x, y, z = field.shape
     return _Field(
         table=table,
         distance=np.ascontiguousarray(table[:, :1]),
-        shape=field.shape,
+        shape=(x, y, z),
         lower=tuple(field.lower.tolist()),
         inverse=1 / field.spacing,
         cull=CULL * field.spacing,

@@ -28,7 +28,7 @@ BASELINES = {
     "one_iteration": Settings(iterations=1, seat=0.0),
 }
 """Searches that lack what they are compared for: the weight of E_DFC is 0, or there is no search. The hand is not closed
-around the object after them either, which would mend much of it."""
+around the object afterwards, which would mend much of that."""
 
 
 @dataclass(frozen=True, eq=False)
