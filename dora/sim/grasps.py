@@ -27,8 +27,8 @@ BASELINES = {
     "no_closure": Settings(weights=Weights(closure=0.0), seat=0.0),
     "one_iteration": Settings(iterations=1, seat=0.0),
 }
-"""Searches that lack what they are compared for: the weight of E_DFC is 0, or there is no search. The hand is not closed
-around the object afterwards, which would mend much of that."""
+"""Searches that lack what they are compared for: the weight of E_DFC is 0, or there is no search. The hand is not
+closed around the object after them, which would mend much of it."""
 
 
 @dataclass(frozen=True, eq=False)
