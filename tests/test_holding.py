@@ -1,0 +1,78 @@
+"""The quasi-static model of a squeezing hand: what it says of grasps whose outcome is known."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dora.affordance.compiled import CompiledEnergy
+from dora.affordance.hand import HandModel
+from dora.affordance.holding import Holding, hold
+from dora.affordance.objects import load_object
+from dora.affordance.protocol import STANDARD, Protocol, pregrasp, squeeze
+from dora.affordance.shipped import load_candidates
+from dora.affordance.signed_distance import SignedDistanceField
+from dora.robot import load_robot
+from dora.robot.rotations import matrix_from_quaternion
+
+ROBOT, CUBE = load_robot("diana7_hit"), load_object("cube")
+HELD = 0.02
+"""Displacement below which an object counts as held [m]."""
+
+
+@pytest.fixture(scope="module")
+def energy() -> CompiledEnergy:
+    return CompiledEnergy(HandModel(ROBOT), SignedDistanceField(CUBE.solid))
+
+
+def held(
+    energy: CompiledEnergy,
+    away: float = 0.0,
+    mass: float = CUBE.mass,
+    protocol: Protocol = STANDARD,
+    open_: bool = False,
+) -> Holding:
+    """The best four stored grasps of the cube, moved up by `away` [m]."""
+    grasps = load_candidates("cube").select(slice(4))
+    wrist = torch.eye(4).repeat(4, 1, 1)
+    wrist[:, :3, :3] = matrix_from_quaternion(grasps.quaternion)
+    wrist[:, :3, 3] = grasps.position + torch.tensor([0.0, 0.0, away])
+    opened = pregrasp(ROBOT, grasps.joints)
+    return hold(energy, wrist, opened, opened if open_ else squeeze(ROBOT, grasps.joints), mass, protocol)
+
+
+def test_grasps_that_hold_in_simulation_hold_in_the_model(energy: CompiledEnergy):
+    found = held(energy)
+    assert (found.displacement.amax(-1) < HELD).sum() >= 3
+    assert (found.force > 5).all()
+    assert (found.shift < HELD).all()
+
+
+def test_a_hand_in_the_air_or_left_open_holds_nothing(energy: CompiledEnergy):
+    away = held(energy, away=0.3)
+    assert (away.force == 0).all()
+    assert (away.displacement.amax(-1) > HELD).all()
+    assert (held(energy, open_=True).force < held(energy).force).all()
+
+
+def test_weight_and_slipperiness_tell(energy: CompiledEnergy):
+    found = held(energy)
+    heavy, slippery = held(energy, mass=100 * CUBE.mass), held(energy, protocol=replace(STANDARD, friction=0.02))
+    assert (heavy.displacement.amax(-1) > found.displacement.amax(-1)).all()
+    assert (slippery.displacement.amax(-1) > found.displacement.amax(-1)).all()
+    assert (heavy.quality < found.quality).all()
+
+
+def test_joints_stay_between_open_and_commanded_or_where_the_object_stops_them(energy: CompiledEnergy):
+    grasps = load_candidates("cube").select(slice(4))
+    found = held(energy)
+    low = torch.minimum(pregrasp(ROBOT, grasps.joints), squeeze(ROBOT, grasps.joints))
+    high = torch.maximum(pregrasp(ROBOT, grasps.joints), squeeze(ROBOT, grasps.joints))
+    assert (found.joints > low - 0.2).all()
+    assert (found.joints < high + 0.2).all()
+
+
+def test_the_model_is_repeatable(energy: CompiledEnergy):
+    first, second = held(energy), held(energy)
+    for a, b in zip(first, second, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
