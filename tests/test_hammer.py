@@ -323,7 +323,7 @@ def test_the_nail_never_comes_back_up_and_a_restored_one_stays_where_it_was(benc
 
 
 def test_the_script_catches_strikes_and_stays_clean():
-    starts = 100
+    starts = 50
     task = tasks.make_task("DoraHammer-v1", starts, preset="none")
     task.reset(seed=0)
     zero = torch.zeros(starts, task.action_size)
