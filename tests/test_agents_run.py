@@ -1,27 +1,18 @@
 """The run command refuses bad input with one sentence and exit status 2."""
 
-import importlib.util
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from commands import call, load_command
 
 from dora.agents.presets import recommended
 from dora.agents.runfolder import RunFolder
 
-SCRIPT = Path(__file__).parent.parent / "experiments" / "run.py"
-
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("run_script", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["run_script"] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_command("run")
 
 
 @pytest.mark.parametrize(
@@ -48,8 +39,7 @@ def test_bad_input(
     arguments: str,
     words: str,
 ):
-    monkeypatch.setattr(sys, "argv", ["run.py", *arguments.split()])
-    assert script.main() == 2
+    assert call(script, monkeypatch, *arguments.split()) == 2
     captured = capsys.readouterr()
     assert words in captured.err
     assert captured.err.count("\n") == 1
@@ -58,9 +48,8 @@ def test_bad_input(
 
 @pytest.mark.parametrize("arguments", ["--agent foo", "--no-such-option 1"])
 def test_errors_of_the_parser(script: ModuleType, monkeypatch: pytest.MonkeyPatch, arguments: str):
-    monkeypatch.setattr(sys, "argv", ["run.py", *arguments.split()])
     with pytest.raises(SystemExit) as exit_info:
-        script.main()
+        call(script, monkeypatch, *arguments.split())
     assert exit_info.value.code == 2
 
 
@@ -68,6 +57,5 @@ def test_resume_refuses_another_task(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     RunFolder(tmp_path).create(recommended("DoraCube-v1", "ppo"))
-    monkeypatch.setattr(sys, "argv", ["run.py", "--resume", str(tmp_path), "--env", "DoraJug-v1"])
-    assert script.main() == 2
+    assert call(script, monkeypatch, "--resume", str(tmp_path), "--env", "DoraJug-v1") == 2
     assert "has env DoraCube-v1, not DoraJug-v1" in capsys.readouterr().err

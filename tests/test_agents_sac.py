@@ -118,4 +118,6 @@ def test_only_guided_runs_are_pulled_to_the_prior():
     prior = {name: recommended("DoraCube-v1", "sac", guidance=name).learner for name in ("affordance", "none")}
     assert prior["affordance"] == SACConfig()
     assert prior["none"] == SACConfig(prior=0.0)
+    observed = {"guidance_parts": ["observation"]}
+    assert recommended("DoraCube-v1", "sac", task=observed).learner == SACConfig(prior=0.0)
     assert recommended("DoraCube-v1", "sac", guidance="none", learner={"prior": 0.2}).learner == SACConfig(prior=0.2)

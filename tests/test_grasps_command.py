@@ -1,8 +1,6 @@
 """The grasp command: bad input, what it writes, interruption, and a mesh that nobody here made."""
 
-import importlib.util
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -10,6 +8,7 @@ from types import ModuleType
 import mani_skill
 import pytest
 import torch
+from commands import call, load_command
 
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.objects import load_object
@@ -20,7 +19,6 @@ from dora.robot import load_robot
 from dora.sim import grasps
 from dora.sim.validation import Reason, Validation
 
-SCRIPT = Path(__file__).parent.parent / "experiments" / "grasps.py"
 ASSETS = Path(mani_skill.__file__).parent / "assets"
 KEYS = {
     "object", "robot", "requested", "optimised", "valid", "valid_per_second", "optimise_seconds", "sim_success_rate",
@@ -31,18 +29,7 @@ QUICK = Settings(iterations=20)
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("grasps_script", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["grasps_script"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def run(script: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["grasps.py", *arguments])
-    return script.main()
+    return load_command("grasps")
 
 
 @pytest.mark.parametrize(
@@ -68,7 +55,7 @@ def test_bad_input(
     arguments: str,
     words: str,
 ):
-    assert run(script, monkeypatch, *arguments.split()) == 2
+    assert call(script, monkeypatch, *arguments.split()) == 2
     captured = capsys.readouterr()
     assert words in captured.err
     assert captured.err.count("\n") == 1
@@ -78,7 +65,7 @@ def test_bad_input(
 @pytest.mark.parametrize("arguments", ["--object spoon", "--validate isaac", "--no-such-option 1"])
 def test_errors_of_the_parser(script: ModuleType, monkeypatch: pytest.MonkeyPatch, arguments: str):
     with pytest.raises(SystemExit) as exit_info:
-        run(script, monkeypatch, *arguments.split())
+        call(script, monkeypatch, *arguments.split())
     assert exit_info.value.code == 2
 
 
@@ -89,7 +76,7 @@ def test_files_and_table(
     monkeypatch.setattr(grasps, "Settings", lambda: QUICK)
     out = tmp_path / "new" / "jug.safetensors"
     arguments = ("--object", "jug", "--num", "6", "--baselines", "3", "--seed", "4", "--out", str(out))
-    assert run(script, monkeypatch, *arguments) == 0
+    assert call(script, monkeypatch, *arguments) == 0
     shown = capsys.readouterr().out
     assert shown.splitlines()[-1] == str(out)
     assert "no closure" in shown
@@ -118,7 +105,7 @@ def test_interruption_leaves_nothing(
 
     monkeypatch.setattr(grasps, "optimise", stop)
     out = tmp_path / "jug.safetensors"
-    assert run(script, monkeypatch, "--object", "jug", "--out", str(out)) == 130
+    assert call(script, monkeypatch, "--object", "jug", "--out", str(out)) == 130
     assert "nothing was written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
@@ -169,7 +156,7 @@ def test_a_mesh_from_elsewhere_goes_all_the_way(
     bottle = ASSETS / "deformable_manipulation" / "bottle.glb"
     out = tmp_path / "bottle.safetensors"
     options = ("--mesh", str(bottle), "--scale", "0.03", "--num", "8", "--baselines", "0", "--validate", "sapien")
-    assert run(script, monkeypatch, *options, "--out", str(out)) == 0
+    assert call(script, monkeypatch, *options, "--out", str(out)) == 0
     report = json.loads(out.with_suffix(".json").read_text())
     candidates = GraspCandidates.load(out)
     assert candidates.object == "bottle"

@@ -1,12 +1,12 @@
 """DoraHammer-v1: ballistics and striking geometry on invented states, the nail, and what the scripted solution does."""
 
 from collections.abc import Iterator
-from dataclasses import fields
 from math import pi
 
 import pytest
 import sapien
 import torch
+from invented import zeros
 from mani_skill.utils.structs import Pose
 from torch import Tensor
 
@@ -20,12 +20,7 @@ from dora.tasks.hammering import Strike, arrival, blend, compose, fall_time, fal
 from dora.tasks.nail import BLOW_SPEED, TRAVEL
 
 FACE = (0.04, 0.0, 0.04)
-SIZES = {
-    "arm_q": 7, "hand_q": 20, "hand_v": 20, "hand_target": 20, "wrist_q": 4, "object_q": 4, "goal_q": 4,
-    "touch": 6, "force": 6, "action": 26, "previous_action": 26, "correction": 26,
-    "goal_pregrasp": 20, "goal_grasp": 20, "phase": len(PHASES), "contact_finger": 0,
-}  # fmt: skip
-SCALARS = ("supported", "penetration", "deepest", "stage", "time", "nail_depth", "nail_driven", "drift_p", "drift_r")
+SCALARS = ("nail_depth", "nail_driven", "drift_p", "drift_r")
 FLAT = quaternion_multiply(
     quaternion_from_rotation_vector(torch.tensor([0.0, pi / 2, 0.0])), torch.tensor([1.0, 0.0, 0.0, 0.0])
 )
@@ -34,22 +29,12 @@ FLAT = quaternion_multiply(
 
 def invented(n: int, **given: Tensor) -> HammerSnapshot:
     """A snapshot of zeros and unit quaternions, with what is given."""
-    values: dict[str, Tensor] = {}
-    for f in fields(HammerSnapshot):
-        shape = (n,) if f.name in SCALARS else (n, SIZES.get(f.name, 3))
-        values[f.name] = torch.zeros(shape)
-        if f.name.endswith("_q") and SIZES.get(f.name) == 4:
-            values[f.name][:, 0] = 1.0
-    values |= {"tip_p": torch.zeros(n, 5, 3), "tip_q": torch.tensor([1.0, 0, 0, 0]).repeat(n, 5, 1)}
-    values |= {"near_p": torch.zeros(n, 3, 3), "near_q": values["tip_q"][:, :3], "contact_p": torch.zeros(n, 0, 3)}
-    values |= {k: values[k].bool() for k in ("touch", "supported")}
-    values |= {k: values[k].long() for k in ("stage", "contact_finger")}
-    values |= {
+    hammer = {
         "face": torch.tensor(FACE).repeat(n, 1),
         "butt": torch.tensor([0.0, 0.0, -0.22]).repeat(n, 1),
         "neck": torch.tensor([0.0, 0.0, 0.04]).repeat(n, 1),
     }
-    return HammerSnapshot(**(values | given))
+    return HammerSnapshot(**(zeros(HammerSnapshot, n, len(PHASES), SCALARS) | hammer | given))
 
 
 def random_pose(n: int) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,5 @@
 """The page shows the grasps that pass its filters, in a browser if there is one here, else over its websocket."""
 
-import importlib.util
 import socket
 import sys
 import urllib.request
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from browser import find_browser, open_page, until
+from commands import call, load_command
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
@@ -28,7 +28,6 @@ from dora.errors import InputError
 from dora.robot import load_robot
 from dora.robot.rotations import matrix_from_quaternion
 
-SCRIPT = Path(__file__).parent.parent / "experiments" / "view.py"
 COUNT = 12
 
 
@@ -174,13 +173,7 @@ def test_without_viser(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("view_script", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["view_script"] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_command("view")
 
 
 def test_bad_sources(
@@ -201,8 +194,7 @@ def test_bad_sources(
     }
     for source, words in cases.items():
         path = tmp_path / source
-        monkeypatch.setattr(sys, "argv", ["view.py", str(path) if path.exists() else source])
-        assert script.main() == 2
+        assert call(script, monkeypatch, str(path) if path.exists() else source) == 2
         error = capsys.readouterr().err
         assert words in error
         assert error.count("\n") == 1

@@ -46,8 +46,8 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
 }
 """Differences from the defaults of `RunConfig`, and under `learner` from those of the learner."""
 
-UNGUIDED: dict[str, dict[str, Any]] = {"sac": {"prior": 0.0}}
-"""Settings of each learner without guidance, where zero action is no prior to be pulled to."""
+WITHOUT_PRIOR: dict[str, dict[str, Any]] = {"sac": {"prior": 0.0}}
+"""Settings of each learner where actions correct nothing and zero action is no prior to be pulled to."""
 
 POSITIVE = ("total_steps", "num_envs", "eval_every", "eval_episodes", "final_episodes", "eval_envs")
 
@@ -69,10 +69,10 @@ def recommended(env: str, agent: str, **overrides: Any) -> RunConfig:
     learner, given = preset.pop("learner", {}), overrides.pop("learner", None) or {}
     fields = {"guidance": "affordance", "workers": available_cores()} | preset
     fields |= {name: value for name, value in overrides.items() if value is not None}
-    if fields["guidance"] == "none":
-        learner = learner | UNGUIDED.get(agent, {})
+    config = RunConfig(env=env, agent=agent, **fields)
+    learner = learner | ({} if config.has_prior else WITHOUT_PRIOR.get(agent, {}))
     learner = learner | {name: value for name, value in given.items() if value is not None}
-    config = RunConfig(env=env, agent=agent, learner=LEARNER_CONFIGS[agent](**learner), **fields)
+    config = dataclasses.replace(config, learner=LEARNER_CONFIGS[agent](**learner))
     check(config)
     return config
 

@@ -2,21 +2,29 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from math import pi
 from typing import Any, ClassVar, cast
 
 import gymnasium as gym
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from mani_skill.utils.structs import Pose
 from torch import Tensor
 
 from dora.errors import InputError
+from dora.robot.rotations import quaternion_from_rotation_vector
 from dora.sim.batch.actions import check_action
 from dora.tasks.building import BuiltEnv
 from dora.tasks.choice import ERROR_DRAWS
 from dora.tasks.correction import Target, wrist_step
 from dora.tasks.options import FILTER
 from dora.tasks.snapshot import Snapshot, advanced, lifted
+
+TRIES = 8
+"""Starting poses that are drawn for an object that stands."""
+STANDING_DRAWS = 3 * TRIES
+"""Random numbers of one such start: x, y and yaw of each pose."""
 
 
 class DoraEnv(BuiltEnv):
@@ -42,13 +50,27 @@ class DoraEnv(BuiltEnv):
             return self.reach_table.mask(object_p, object_q)
         return torch.ones(len(object_p), len(self.guide.choice.candidates), dtype=torch.bool, device=self.device)
 
-    def first_reachable(
-        self, position: Float[Tensor, "b t 3"], quaternion: Float[Tensor, "b t 4"]
-    ) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 4"]]:
-        """Of t drawn object poses, the first one that leaves a reachable candidate; the very first if none does."""
-        able = self.reachable(position.flatten(0, 1), quaternion.flatten(0, 1)).any(-1).reshape(position.shape[:2])
-        chosen = torch.arange(len(position), device=position.device), able.float().argmax(-1)
-        return position[chosen], quaternion[chosen]
+    def standing(self, u: Float[Tensor, "b d"], height: Float[Tensor, " b"]) -> Pose:
+        """Poses of objects that stand within `START` at any yaw, where a candidate can be reached.
+
+        Args:
+            u: uniform random numbers, x, y and yaw of each of `TRIES` poses; the first that leaves a reachable
+                candidate is taken, or the very first if none does.
+            height: of the objects' origins [m].
+        """
+        assert self.START is not None
+        u = u.reshape(len(u), TRIES, 3)
+        x, y = (
+            c + w * (2 * u[..., k] - 1)
+            for k, (c, w) in enumerate(zip(self.START.centre, self.START.spread, strict=True))
+        )
+        position = torch.stack([x, y, height[:, None].expand_as(x)], -1)
+        turn = torch.zeros_like(position)
+        turn[..., 2] = 2 * pi * u[..., 2]
+        quaternion = quaternion_from_rotation_vector(turn)
+        able = self.reachable(position.flatten(0, 1), quaternion.flatten(0, 1)).any(-1).reshape(len(u), TRIES)
+        chosen = torch.arange(len(u), device=u.device), able.float().argmax(-1)
+        return Pose.create_from_pq(position[chosen], quaternion[chosen])
 
     def extended(self, s: Snapshot) -> Snapshot:
         """The snapshot with what this task reads in addition: a subclass of `Snapshot`."""

@@ -13,12 +13,25 @@ from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.reach_table import Grid
-from dora.robot.rotations import quaternion_apply, quaternion_from_rotation_vector, quaternion_multiply
-from dora.tasks.base import DoraEnv
+from dora.robot.rotations import quaternion_apply, quaternion_multiply
+from dora.tasks.base import STANDING_DRAWS, DoraEnv
 from dora.tasks.observations import Entry
 from dora.tasks.rewards import Term, Terms, closeness
-from dora.tasks.snapshot import Snapshot, derived, goal_error, lifted, opposed, tips_in_object
+from dora.tasks.snapshot import TIP_RADIUS, Snapshot, derived, lifted, opposed, tips_in_object
 from dora.tasks.stages import Stage
+from dora.tasks.terms import (
+    at_candidate,
+    grip,
+    near_region,
+    off_table,
+    paper_affordance,
+    paper_grasp,
+    paper_lift,
+    paper_penalty,
+    penalties,
+    rise,
+    thumb_and_finger,
+)
 
 HALF = 0.03
 """Nominal half edge of the cube [m]."""
@@ -30,20 +43,14 @@ CENTRE = (0.55, 0.0)
 """Middle of the area where the cube starts [m]."""
 SPREAD = 0.08
 """Half width of that area [m]."""
-TRIES = 8
-"""Starting poses that are drawn for every episode; the first one that leaves a reachable candidate is taken."""
 LIFT = 0.10
 """Rise that counts as lifted [m]."""
 NEAR = 0.03
 """Distance of thumb and one more fingertip from the cube's surface that ends the reach [m]."""
-TIP_RADIUS = 0.011
-"""Radius of a fingertip [m]."""
 HOLD = 10
 """Control steps the lifted cube must be held."""
 DEEPEST = 0.003
 """Penetration above which an episode does not count as a success [m]."""
-ALPHA = 4.0
-"""Spatial sensitivity of the affordance reward [1/m]."""
 
 
 @derived
@@ -56,12 +63,11 @@ def surface_distance(s: Snapshot) -> Tensor:
 
 @derived
 def _reach(s: Snapshot) -> Tensor:
-    d = surface_distance(s).clamp(min=0)
-    return torch.maximum(d[:, 0], d[:, 1:].amin(-1))
+    return thumb_and_finger(surface_distance(s))
 
 
 def _rise(s: Snapshot) -> Tensor:
-    return (lifted(s) / LIFT).clamp(0, 1)
+    return rise(s, LIFT)
 
 
 @derived
@@ -83,22 +89,6 @@ STAGES: list[Stage[Snapshot]] = [
 ]
 
 
-def _affordance(s: Snapshot) -> Tensor:
-    """R_affordance with the distance of every fingertip to the nearest point of the region (the cube's surface)."""
-    return torch.exp(-ALPHA * surface_distance(s).clamp(min=0).sum(-1))
-
-
-def _candidate(s: Snapshot) -> Tensor:
-    """Candidate term: 1 at the wrist pose the candidate asks for; held at 1 once the cube has left the table."""
-    shift, turn = goal_error(s)
-    near = closeness(shift.norm(dim=-1) + 0.1 * turn.norm(dim=-1), 0.01, 0.2)
-    return torch.where(lifted(s) > 0.02, torch.ones_like(near), near)
-
-
-def _grasp(s: Snapshot) -> Tensor:
-    return 0.6 * opposed(s).float() + 0.1 * s.touch[:, 1:5].sum(-1)
-
-
 def _lift(s: Snapshot) -> Tensor:
     return _rise(s) * (0.3 + 0.7 * opposed(s).float())
 
@@ -107,53 +97,28 @@ def _clean(s: Snapshot) -> Tensor:
     return (_held(s) & (s.deepest <= DEEPEST)).float()
 
 
-def _deep(s: Snapshot) -> Tensor:
-    return ((s.penetration - 0.0005) / DEEPEST).clamp(0, 1)
-
-
-def _effort(s: Snapshot) -> Tensor:
-    return s.action.square().mean(-1).clamp(max=1)
-
-
-def _change(s: Snapshot) -> Tensor:
-    return ((s.action - s.previous_action).square().mean(-1) / 4).clamp(max=1)
-
-
 TERMS: Terms[Snapshot] = Terms(
     {
-        "affordance": Term(_affordance, 0.3, "affordance", True, "exp(-alpha * sum of fingertip distances)"),
-        "candidate": Term(_candidate, 0.3, "task", True, "closeness of the wrist to the candidate"),
+        "affordance": Term(
+            lambda s: near_region(surface_distance(s)),
+            0.3,
+            "affordance",
+            True,
+            "exp(-alpha * sum of fingertip distances)",
+        ),
+        "candidate": Term(
+            lambda s: at_candidate(s, off_table(s)), 0.3, "task", True, "closeness of the wrist to the candidate"
+        ),
         "reach": Term(lambda s: closeness(_reach(s), 0.0, 0.25), 0.3, doc="thumb and one finger near the cube"),
-        "grasp": Term(_grasp, 0.4, doc="contacts: thumb against a finger, and how many fingers"),
+        "grasp": Term(grip, 0.4, doc="contacts: thumb against a finger, and how many fingers"),
         "lift": Term(_lift, 3.0, doc="rise, saturating at the target height"),
         "held": Term(_clean, 1.5, doc="lifted, opposed, off the table, and no overlap above 3 mm so far"),
-        "effort": Term(_effort, -0.05, "penalty", doc="mean square of the action"),
-        "change": Term(_change, -0.4, "penalty", doc="mean square of the action's change"),
-        "penetration": Term(_deep, -1.0, "penalty", doc="overlap beyond 0.5 mm"),
+        **penalties(0.0005, DEEPEST),
     }
 )
 
-
-def _paper_affordance(s: Snapshot) -> Tensor:
-    return torch.exp(-ALPHA * (s.tip_p - s.object_p[:, None]).norm(dim=-1).sum(-1))
-
-
 PAPER_TERMS: Terms[Snapshot] = Terms(
-    {
-        "affordance": Term(_paper_affordance, 1.0, "affordance", True, "exp(-alpha sum ||p_tip - p_afford||)"),
-        "grasp": Term(
-            lambda s: torch.exp((s.wrist_p - s.goal_p)[:, 2].clamp(max=0)) * (s.stage < 2),
-            1.0,
-            guided=True,
-            doc="exp(z_current - z_candidate), z clipped at the candidate",
-        ),
-        "lift": Term(
-            lambda s: torch.exp(lifted(s).clamp(0, LIFT) - LIFT) * (s.stage >= 2),
-            1.0,
-            doc="exp(z - z_0), saturating",
-        ),
-        "penalty": Term(lambda s: s.action.square().mean(-1).clamp(max=1), -0.1, "penalty", doc="sum of action^2"),
-    }
+    {**paper_affordance(lambda s: s.object_p), **paper_grasp(2), **paper_lift(2, LIFT), **paper_penalty()}
 )
 
 
@@ -221,7 +186,7 @@ class CubeEnv(DoraEnv):
         "half": Entry(lambda s: s.object_half[:, :1], "m", "half edge of the cube"),
         "surface": Entry(surface_distance, "m", "distance of each fingertip's surface from the cube's", True),
     }
-    DRAWS = 3 * TRIES
+    DRAWS = STANDING_DRAWS
     MAX_STEPS = 100
     DEEPEST = DEEPEST
     OBJECT = "cube"
@@ -253,10 +218,5 @@ class CubeEnv(DoraEnv):
         return merged
 
     def place(self, env_idx: Tensor, u: Tensor) -> None:
-        u = u.reshape(-1, TRIES, 3)
-        x, y = (c + SPREAD * (2 * u[..., k] - 1) for k, c in enumerate(CENTRE))
-        position = torch.stack([x, y, self.object_half[env_idx, :1].expand(-1, TRIES)], -1)
-        turn = torch.zeros_like(position)
-        turn[..., 2] = 2 * pi * u[..., 2]
-        quaternion = quaternion_from_rotation_vector(turn)
-        self.target_object.set_pose(Pose.create_from_pq(*self.first_reachable(position, quaternion)))
+        """The cube stands on a face, somewhere in the area, at any yaw."""
+        self.target_object.set_pose(self.standing(u, self.object_half[env_idx, 0]))

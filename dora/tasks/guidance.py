@@ -89,6 +89,7 @@ class GraspReference(Reference):
         }  # fmt: skip
 
     def begin(self, rows: Int[Tensor, " b"], wrist_p: Float[Tensor, "b 3"], wrist_q: Float[Tensor, "b 4"]) -> None:
+        """Starts anew at full standoff, hand open, in the environments `rows`; world wrist poses [m], wxyz."""
         for buffer in self.buffers.values():
             buffer[rows] = 0.0
         self.buffers["standoff"][rows] = STANDOFF
@@ -98,6 +99,10 @@ class GraspReference(Reference):
         self.phase.reset(rows)
 
     def target(self, s: Snapshot) -> Target:
+        """The candidate's live goal less the standoff until the fingers close, then where the wrist was, raised.
+
+        World wrist pose [m], wxyz, and hand joints [rad] between the candidate's pre-grasp and grasp.
+        """
         b, phase = self.buffers, self.phase.index
         free = s.goal_p - s.goal_approach * b["standoff"][:, None]
         up = torch.zeros_like(free)
@@ -116,6 +121,7 @@ class GraspReference(Reference):
         self.buffers["target_q"].copy_(target.wrist_q)
 
     def advance(self, s: Snapshot) -> None:
+        """Compares the wrist with its last target, changes phase, and moves the ramps on by a control step."""
         b, before = self.buffers, self.phase.index.clone()
         offset = (s.goal_p - s.wrist_p).norm(dim=-1)
         tracking = Tracking(

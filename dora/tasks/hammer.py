@@ -205,6 +205,11 @@ class HammerEnv(DoraEnv):
         return [self.table, *self.nail.links]
 
     def place(self, env_idx: Tensor, u: Tensor) -> None:
+        """Releases hammers (b,) over the grip and puts the nail back.
+
+        `u` (b, 9) in [0, 1): x, y and height of the handle's lower end [m], tilt about x and y and roll [rad], spin
+        [rad/s], world frame.
+        """
         u = 2 * u - 1
         height = (FALL[0] + FALL[1]) / 2 + u[:, 2] * (FALL[1] - FALL[0]) / 2
         middle = torch.tensor(RELEASE, device=self.device).repeat(len(env_idx), 1)
@@ -222,6 +227,7 @@ class HammerEnv(DoraEnv):
     # ---------------------------------------------------------------- reading
 
     def extended(self, s: Snapshot) -> HammerSnapshot:
+        """The snapshot with the nail (top in the world, depth [m]), points of the hammer, its motion in the hand."""
         depth = self.nail.depth
         nail_p = torch.tensor(NAIL_TOP, device=self.device).repeat(self.num_envs, 1)
         nail_p[:, 2] -= depth

@@ -17,8 +17,8 @@ from dora.tasks.hammer_snapshot import (
 )
 from dora.tasks.nail import DRIVEN
 from dora.tasks.rewards import Term, Terms, closeness
-from dora.tasks.snapshot import Snapshot, goal_error
 from dora.tasks.stages import Stage
+from dora.tasks.terms import at_candidate, near_region, paper_affordance, paper_grasp, paper_penalty, penalties
 
 CAUGHT_SPEED = 0.5
 """Speed of the hammer in the hand below which it has been caught [m/s]."""
@@ -34,8 +34,6 @@ HOLD = 10
 """Control steps the hammer must be held over the nail."""
 DROPPED = 0.12
 """Distance of the handle from the middle of the grip at which the hammer is lost [m]."""
-ALPHA = 4.0
-"""Spatial sensitivity of the affordance reward [1/m]."""
 DEEPEST = 0.005
 """Penetration above which an episode does not count as a success [m]."""
 
@@ -87,16 +85,6 @@ STAGES: list[Stage[HammerSnapshot]] = [
 ORIENT, STRIKE = 2, 3
 
 
-def _affordance(s: HammerSnapshot) -> Tensor:
-    return torch.exp(-ALPHA * tip_distance(s).clamp(min=0).sum(-1))
-
-
-def _candidate(s: HammerSnapshot) -> Tensor:
-    shift, turn = goal_error(s)
-    near = closeness(shift.norm(dim=-1) + 0.1 * turn.norm(dim=-1), 0.01, 0.2)
-    return torch.where(s.stage >= ORIENT, torch.ones_like(near), near)
-
-
 def _catch(s: HammerSnapshot) -> Tensor:
     return closeness(grip_distance(s), 0.02, 0.3) * (0.5 + 0.1 * fingers_on(s))
 
@@ -114,25 +102,21 @@ def _clean(s: HammerSnapshot) -> Tensor:
     return ((s.nail_driven >= DRIVEN) & (s.stage > STRIKE) & (s.deepest <= DEEPEST)).float()
 
 
-def _deep(s: Snapshot) -> Tensor:
-    return ((s.penetration - 0.001) / DEEPEST).clamp(0, 1)
-
-
-def _effort(s: Snapshot) -> Tensor:
-    return s.action.square().mean(-1).clamp(max=1)
-
-
-def _change(s: Snapshot) -> Tensor:
-    return ((s.action - s.previous_action).square().mean(-1) / 4).clamp(max=1)
-
-
 TERMS: Terms[HammerSnapshot] = Terms(
     {
         "affordance": Term(
-            _affordance, 0.2, "affordance", True, "exp(-alpha * sum of fingertip distances to the handle)"
+            lambda s: near_region(tip_distance(s)),
+            0.2,
+            "affordance",
+            True,
+            "exp(-alpha * sum of fingertip distances to the handle)",
         ),
         "candidate": Term(
-            _candidate, 0.3, "task", True, "closeness of the wrist to the candidate until the hammer is held"
+            lambda s: at_candidate(s, s.stage >= ORIENT),
+            0.3,
+            "task",
+            True,
+            "closeness of the wrist to the candidate until the hammer is held",
         ),
         "catch": Term(_catch, 0.4, doc="handle near the middle of the grip, and fingers on it"),
         "still": Term(_kept, 0.4, doc="the hammer does not move in the hand"),
@@ -143,33 +127,21 @@ TERMS: Terms[HammerSnapshot] = Terms(
         ),
         "strike": Term(_depth, 2.0, doc="depth driven by blows, saturating at the target depth"),
         "driven": Term(_clean, 1.5, doc="all stages done, and no overlap above 5 mm so far"),
-        "effort": Term(_effort, -0.05, "penalty", doc="mean square of the action"),
-        "change": Term(_change, -0.4, "penalty", doc="mean square of the action's change"),
-        "penetration": Term(_deep, -1.0, "penalty", doc="overlap beyond 1 mm"),
+        **penalties(0.001, DEEPEST),
     }
 )
 
 
-def _paper_affordance(s: HammerSnapshot) -> Tensor:
-    centre = s.object_p + (s.butt + s.neck) / 2
-    return torch.exp(-ALPHA * (s.tip_p - centre[:, None]).norm(dim=-1).sum(-1))
-
-
 PAPER_TERMS: Terms[HammerSnapshot] = Terms(
     {
-        "affordance": Term(_paper_affordance, 1.0, "affordance", True, "exp(-alpha sum ||p_tip - p_afford||)"),
-        "grasp": Term(
-            lambda s: torch.exp((s.wrist_p - s.goal_p)[:, 2].clamp(max=0)) * (s.stage < ORIENT),
-            1.0,
-            guided=True,
-            doc="exp(z_current - z_candidate), z clipped at the candidate",
-        ),
+        **paper_affordance(lambda s: s.object_p + (s.butt + s.neck) / 2),
+        **paper_grasp(ORIENT),
         "orient": Term(
             lambda s: (1 - misalignment(s) / pi) * (s.stage >= ORIENT),
             1.0,
             doc="-theta with theta = arccos(2 <r, r*>^2 - 1), the rotation left, over pi and plus one",
         ),
         "strike": Term(_depth, 1.0, doc="depth driven by blows"),
-        "penalty": Term(_effort, -0.1, "penalty", doc="sum of action^2"),
+        **paper_penalty(),
     }
 )

@@ -7,12 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.robot.rotations import quaternion_apply, quaternion_inverse
-from dora.tasks.snapshot import Snapshot, derived, in_wrist
+from dora.tasks.snapshot import TIP_RADIUS, Snapshot, derived, in_wrist
 
 GRIP = (0.045, 0.0, 0.150)
 """Middle of a closed grip in the hand frame [m]."""
-TIP_RADIUS = 0.011
-"""Radius of a fingertip [m]."""
 HANDLE_RADIUS = 0.0105
 """Radius of the handle, the smaller half axis of its oval [m]."""
 IN_HAND = 0.07

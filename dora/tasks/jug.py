@@ -1,14 +1,14 @@
 """DoraJug-v1: grasp a jug by its handle and lift it upright."""
 
 from functools import cache
-from math import cos, pi, radians
+from math import cos, radians
 from typing import ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from mani_skill.utils.registration import register_env
-from mani_skill.utils.structs import Actor, Pose
+from mani_skill.utils.structs import Actor
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
@@ -18,22 +18,35 @@ from dora.affordance.reach_table import Grid
 from dora.affordance.shipped import best_candidates
 from dora.affordance.structure import AffordanceObject
 from dora.affordance.voting import vote
-from dora.robot.rotations import quaternion_apply, quaternion_from_rotation_vector
+from dora.robot.rotations import quaternion_apply
 from dora.sim.objects import build_object
-from dora.tasks.base import DoraEnv
+from dora.tasks.base import STANDING_DRAWS, DoraEnv
 from dora.tasks.observations import Entry
 from dora.tasks.rewards import Term, Terms, closeness
 from dora.tasks.snapshot import (
+    TIP_RADIUS,
     Snapshot,
     derived,
     derived_from_contacts,
-    goal_error,
     in_wrist,
     lifted,
     opposed,
     tips_in_object,
 )
 from dora.tasks.stages import Stage
+from dora.tasks.terms import (
+    at_candidate,
+    grip,
+    near_region,
+    off_table,
+    paper_affordance,
+    paper_grasp,
+    paper_lift,
+    paper_penalty,
+    penalties,
+    rise,
+    thumb_and_finger,
+)
 
 EMPTY, FULL = 0.30, 0.60
 """Mass of the empty and of the full jug [kg]."""
@@ -41,8 +54,6 @@ CENTRE = (0.55, 0.0)
 """Middle of the area where the jug starts [m]."""
 SPREAD = 0.08
 """Half width of that area [m]."""
-TRIES = 8
-"""Starting poses that are drawn for every episode; the first one that leaves a reachable candidate is taken."""
 LIFT = 0.10
 """Rise that counts as lifted [m]."""
 UPRIGHT = radians(30)
@@ -53,14 +64,10 @@ DROPPED = 0.05
 """A jug that has risen this far and stands or lies on the table again was dropped [m]."""
 NEAR = 0.04
 """Distance of thumb and one more fingertip from the handle that ends the reach [m]."""
-TIP_RADIUS = 0.011
-"""Radius of a fingertip [m]."""
 HOLD = 10
 """Control steps the lifted jug must be held."""
 DEEPEST = 0.005
 """Penetration above which an episode does not count as a success [m]."""
-ALPHA = 4.0
-"""Spatial sensitivity of the affordance reward [1/m]."""
 CLASS = "HandleGrasp"
 """The grasp class that the task asks for."""
 MOST = 40
@@ -119,18 +126,12 @@ def uprightness(s: Snapshot) -> Float[Tensor, " n"]:
     return quaternion_apply(s.object_q, up)[:, 2]
 
 
-def _worst(distance: Tensor) -> Tensor:
-    """Distance of thumb and nearest finger (n, 5) -> (n,): the larger of the two."""
-    near = distance.clamp(min=0)
-    return torch.maximum(near[:, 0], near[:, 1:].amin(-1))
-
-
 def _reach(s: Snapshot) -> Tensor:
-    return _worst(handle_distance(s))
+    return thumb_and_finger(handle_distance(s))
 
 
 def _rise(s: Snapshot) -> Tensor:
-    return (lifted(s) / LIFT).clamp(0, 1)
+    return rise(s, LIFT)
 
 
 @derived
@@ -140,7 +141,7 @@ def held(s: Snapshot) -> Bool[Tensor, " n"]:
 
 
 def _away(s: Snapshot) -> Tensor:
-    return _worst(region_distances(s).amin(-1))
+    return thumb_and_finger(region_distances(s).amin(-1))
 
 
 STAGES: list[Stage[Snapshot]] = [
@@ -164,22 +165,6 @@ STAGES: list[Stage[Snapshot]] = [
 ]
 
 
-def _affordance(s: Snapshot) -> Tensor:
-    """R_affordance with the distance of every fingertip to the nearest point of the handle."""
-    return torch.exp(-ALPHA * handle_distance(s).clamp(min=0).sum(-1))
-
-
-def _candidate(s: Snapshot) -> Tensor:
-    """Candidate term: 1 at the wrist pose the candidate asks for; held at 1 once the jug has left the table."""
-    shift, turn = goal_error(s)
-    near = closeness(shift.norm(dim=-1) + 0.1 * turn.norm(dim=-1), 0.01, 0.2)
-    return torch.where(lifted(s) > 0.02, torch.ones_like(near), near)
-
-
-def _grasp(s: Snapshot) -> Tensor:
-    return 0.6 * opposed(s).float() + 0.1 * s.touch[:, 1:5].sum(-1)
-
-
 def _lift(s: Snapshot) -> Tensor:
     """Rise, less of it the more the jug tilts: half of it at the largest tilt that counts."""
     level = 1 - 0.5 * (1 - uprightness(s)) / (1 - cos(UPRIGHT))
@@ -194,31 +179,25 @@ def _tilt(s: Snapshot) -> Tensor:
     return (1 - uprightness(s)).clamp(0, 1)
 
 
-def _deep(s: Snapshot) -> Tensor:
-    return ((s.penetration - 0.001) / DEEPEST).clamp(0, 1)
-
-
-def _effort(s: Snapshot) -> Tensor:
-    return s.action.square().mean(-1).clamp(max=1)
-
-
-def _change(s: Snapshot) -> Tensor:
-    return ((s.action - s.previous_action).square().mean(-1) / 4).clamp(max=1)
-
-
 TERMS: Terms[Snapshot] = Terms(
     {
-        "affordance": Term(_affordance, 0.3, "affordance", True, "exp(-alpha * sum of fingertip distances to handle)"),
-        "candidate": Term(_candidate, 0.3, "task", True, "closeness of the wrist to the candidate"),
+        "affordance": Term(
+            lambda s: near_region(handle_distance(s)),
+            0.3,
+            "affordance",
+            True,
+            "exp(-alpha * sum of fingertip distances to handle)",
+        ),
+        "candidate": Term(
+            lambda s: at_candidate(s, off_table(s)), 0.3, "task", True, "closeness of the wrist to the candidate"
+        ),
         "class": Term(lambda s: by_the_handle(s).float(), 0.4, "task", True, "the contacts vote for HandleGrasp"),
         "reach": Term(lambda s: closeness(_away(s), 0.0, 0.25), 0.3, doc="thumb and one finger near the jug"),
-        "grasp": Term(_grasp, 0.4, doc="contacts: thumb against a finger, and how many fingers"),
+        "grasp": Term(grip, 0.4, doc="contacts: thumb against a finger, and how many fingers"),
         "lift": Term(_lift, 3.0, doc="rise, saturating at the target height, less if tilted"),
         "held": Term(_clean, 1.5, doc="lifted, upright, opposed, off the table, no overlap above 5 mm so far"),
         "tilt": Term(_tilt, -0.3, "penalty", doc="1 - cosine of the tilt"),
-        "effort": Term(_effort, -0.05, "penalty", doc="mean square of the action"),
-        "change": Term(_change, -0.4, "penalty", doc="mean square of the action's change"),
-        "penetration": Term(_deep, -1.0, "penalty", doc="overlap beyond 1 mm"),
+        **penalties(0.001, DEEPEST),
     }
 )
 
@@ -233,26 +212,8 @@ def handle_p(s: Snapshot) -> Float[Tensor, "n 3"]:
     return s.object_p + quaternion_apply(s.object_q, _scale(s)[:, None] * _handle_centre())
 
 
-def _paper_affordance(s: Snapshot) -> Tensor:
-    return torch.exp(-ALPHA * (s.tip_p - handle_p(s)[:, None]).norm(dim=-1).sum(-1))
-
-
 PAPER_TERMS: Terms[Snapshot] = Terms(
-    {
-        "affordance": Term(_paper_affordance, 1.0, "affordance", True, "exp(-alpha sum ||p_tip - p_afford||)"),
-        "grasp": Term(
-            lambda s: torch.exp((s.wrist_p - s.goal_p)[:, 2].clamp(max=0)) * (s.stage < 2),
-            1.0,
-            guided=True,
-            doc="exp(z_current - z_candidate), z clipped at the candidate",
-        ),
-        "lift": Term(
-            lambda s: torch.exp(lifted(s).clamp(0, LIFT) - LIFT) * (s.stage >= 2),
-            1.0,
-            doc="exp(z - z_0), saturating",
-        ),
-        "penalty": Term(lambda s: s.action.square().mean(-1).clamp(max=1), -0.1, "penalty", doc="sum of action^2"),
-    }
+    {**paper_affordance(handle_p), **paper_grasp(2), **paper_lift(2, LIFT), **paper_penalty()}
 )
 
 
@@ -288,7 +249,7 @@ class JugEnv(DoraEnv):
         "handle_p": Entry(lambda s: in_wrist(s, handle_p(s)), "m", "centre of the handle in the hand frame", True),
         "class": Entry(_label_one_hot, "1", "region that the contacts vote for: body, handle, rim", True),
     }
-    DRAWS = 3 * TRIES
+    DRAWS = STANDING_DRAWS
     MAX_STEPS = 120
     DEEPEST = DEEPEST
     CONTACT_POINTS = 32
@@ -309,14 +270,8 @@ class JugEnv(DoraEnv):
         return EMPTY + (FULL - EMPTY) * u if self.preset.mass > 0 else nominal
 
     def place(self, env_idx: Tensor, u: Tensor) -> None:
-        u = u.reshape(-1, TRIES, 3)
-        height = jug().support * self.scale[env_idx, None].expand(-1, TRIES)
-        x, y = (c + SPREAD * (2 * u[..., k] - 1) for k, c in enumerate(CENTRE))
-        position = torch.stack([x, y, height], -1)
-        turn = torch.zeros_like(position)
-        turn[..., 2] = 2 * pi * u[..., 2]
-        quaternion = quaternion_from_rotation_vector(turn)
-        self.target_object.set_pose(Pose.create_from_pq(*self.first_reachable(position, quaternion)))
+        """The jug stands upright, somewhere in the area, at any yaw."""
+        self.target_object.set_pose(self.standing(u, jug().support * self.scale[env_idx]))
 
     def failed(self, s: Snapshot) -> Bool[Tensor, " n"]:
         """Also when the jug has tipped over, or stands on the table again after it was lifted."""

@@ -18,6 +18,8 @@ from dora.robot.rotations import (
 
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 """Finger order of every tensor with a finger axis."""
+TIP_RADIUS = 0.011
+"""Radius of a fingertip [m]."""
 
 
 CONTACT_CLASSES = ("none", "palm", *FINGERS)
