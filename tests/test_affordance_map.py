@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dora.affordance.lookup import NearestTable, nearest_by_comparison
-from dora.affordance.map import COUNT, PALETTE, AffordanceMap
+from dora.affordance.map import COUNT, AffordanceMap
 from dora.affordance.objects import load_object
+from dora.affordance.palette import PALETTE
 from dora.affordance.sampling import sample_evenly
 from dora.errors import InputError
 

@@ -21,7 +21,8 @@ from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand import HandModel
 from dora.affordance.hand_mesh import HandMesh
 from dora.affordance.objects import load_object
-from dora.affordance.pictures import PALETTE, PARTS
+from dora.affordance.palette import PALETTE
+from dora.affordance.pictures import PARTS
 from dora.affordance.shipped import shipped_path
 from dora.affordance.viewing import CONTACTS, VALID, Filter, GraspPage, Surface, describe
 from dora.errors import InputError

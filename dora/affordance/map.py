@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dora.affordance.lookup import NearestTable, RegionField
+from dora.affordance.palette import PALETTE, colours
 from dora.affordance.rasteriser import Camera, render
 from dora.affordance.sampling import sample_evenly
 from dora.affordance.structure import AffordanceObject
@@ -24,8 +25,6 @@ COUNT = 4096
 """Surface points of a map."""
 FORMAT = "dora-map 1"
 """Format and version of a file of a map."""
-PALETTE = ((77, 121, 168), (242, 142, 43), (89, 161, 79), (225, 87, 89), (118, 183, 178), (237, 201, 72))
-"""Colours (red, green, blue) of the regions in pictures, in their order, repeated if there are more."""
 VIEWS = ((-1.0, 0.35), (2.4, 0.35))
 """Azimuth and elevation (rad) of the pictures."""
 DISC_CORNERS, DISC_SHARE, DISC_LIFT = 8, 0.85, 2e-4
@@ -167,9 +166,7 @@ class AffordanceMap:
 
     def painted(self) -> trimesh.Trimesh:
         """The surface with each face in the colour of its region (object frame, m)."""
-        colors = np.array([PALETTE[i % len(PALETTE)] for i in range(len(self.names))], np.uint8)
-        alpha = np.full((len(self.names), 1), 255, np.uint8)
-        rgba = np.concatenate([colors, alpha], 1)[self.face_labels]
+        rgba = colours(self.face_labels, PALETTE)
         return trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, face_colors=rgba, process=False)
 
     def discs(self) -> trimesh.Trimesh:
@@ -183,8 +180,7 @@ class AffordanceMap:
         corners = (self.points + DISC_LIFT * self.normals)[:, None] + DISC_SHARE * radius * ring
         fan = torch.tensor([[0, i, i + 1] for i in range(1, DISC_CORNERS - 1)])
         faces = fan + DISC_CORNERS * torch.arange(len(self))[:, None, None]
-        colors = np.array([PALETTE[i % len(PALETTE)] for i in self.labels.tolist()], np.uint8)
-        colors = np.repeat(np.concatenate([colors, np.full((len(self), 1), 255, np.uint8)], 1), len(fan), axis=0)
+        colors = np.repeat(colours(self.labels.numpy(), PALETTE), len(fan), axis=0)
         vertices = corners.reshape(-1, 3).numpy()
         return trimesh.Trimesh(vertices, faces.reshape(-1, 3).numpy(), face_colors=colors, process=False)
 

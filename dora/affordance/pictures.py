@@ -8,22 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import Int, UInt8
+from jaxtyping import Int
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand_mesh import HandMesh
+from dora.affordance.palette import PALETTE, colours
 from dora.affordance.rasteriser import Camera, render
 from dora.affordance.structure import AffordanceObject
 from dora.files import write_bytes
 from dora.robot import RobotDescription
 
-PALETTE = (
-    (78, 121, 167), (242, 142, 43), (89, 161, 79), (225, 87, 89),
-    (118, 183, 178), (237, 201, 72), (176, 122, 161), (156, 117, 95),
-)  # fmt: skip
-"""Colours (red, green, blue) of regions in the order of an object's labels, repeated if there are more."""
 PARTS = {
     "no contact": (205, 205, 205),
     "palm": (122, 92, 70),
@@ -40,13 +36,6 @@ DPI = 100
 """Pixels per inch of figures."""
 VIEWS = ((0.6, 0.35), (2.6, 0.35), (4.6, 0.6))
 """Azimuth and elevation of the views of a map [rad]."""
-
-
-def colours(indices: Int[np.ndarray, " n"], table: Sequence[tuple[int, int, int]]) -> UInt8[np.ndarray, "n 4"]:
-    """Opaque colours of indices into a table, which is repeated."""
-    return np.append(
-        np.asarray(table, dtype=np.uint8)[indices % len(table)], np.full((len(indices), 1), 255, np.uint8), 1
-    )
 
 
 def coloured(obj: AffordanceObject) -> trimesh.Trimesh:

@@ -16,7 +16,8 @@ from dora.affordance.candidates import GraspCandidates
 from dora.affordance.contact_map import contact_semantic_map
 from dora.affordance.hand import HandModel
 from dora.affordance.hand_mesh import GAMMA, HandMesh, face_colours
-from dora.affordance.pictures import PALETTE, PARTS, colours
+from dora.affordance.palette import PALETTE, colours
+from dora.affordance.pictures import PARTS
 from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
 from dora.robot import RobotDescription

@@ -11,6 +11,7 @@ from mani_skill.utils.building.actor_builder import ActorBuilder
 from mani_skill.utils.structs import Actor, Pose
 from sapien import physx
 
+from dora.affordance.palette import PALETTE, colours
 from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
 from dora.sim.shapes import collision_shape
@@ -18,11 +19,7 @@ from dora.sim.shapes import collision_shape
 CONTACT_OFFSET = 0.005
 """Distance at which PhysX begins to look for contacts with an object [m]."""
 ROUGHNESS = 0.5
-COLOURS = (
-    (0.30, 0.47, 0.66, 1.0), (0.95, 0.56, 0.17, 1.0), (0.35, 0.63, 0.31, 1.0), (0.88, 0.34, 0.35, 1.0),
-    (0.46, 0.72, 0.70, 1.0), (0.93, 0.79, 0.28, 1.0), (0.69, 0.48, 0.63, 1.0), (0.61, 0.46, 0.37, 1.0),
-)  # fmt: skip
-"""Colours (RGBA) of an object's regions in the order of its labels, repeated if there are more."""
+"""Of an object's surface in pictures, 0 to 1."""
 
 
 def object_entity(
@@ -87,7 +84,9 @@ def _visual(obj: AffordanceObject, scale: float) -> sapien.render.RenderBodyComp
             triangles=np.arange(len(corners), dtype=np.uint32).reshape(-1, 3),
             normals=np.repeat(part.face_normals, 3, axis=0).astype(np.float32),
             uvs=np.zeros((len(corners), 2), np.float32),
-            material=sapien.render.RenderMaterial(base_color=list(COLOURS[index % len(COLOURS)]), roughness=ROUGHNESS),
+            material=sapien.render.RenderMaterial(
+                base_color=(colours(np.array([index]), PALETTE)[0] / 255).tolist(), roughness=ROUGHNESS
+            ),
         )
         shape.name = label
         component.attach(shape)

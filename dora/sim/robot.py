@@ -58,14 +58,8 @@ class DescribedRobot(BaseAgent):
         for shape in self.description.shapes.get(link.name, ()):
             material = PhysxMaterial(contact.friction, contact.friction, contact.restitution) if contact else None
             pose = sapien.Pose(shape.position, shape.quaternion)
-            if shape.kind == "box":
-                link.add_box_collision(pose, list(shape.size), material)
-            elif shape.kind == "sphere":
-                link.add_sphere_collision(pose, shape.size[0], material)
-            elif shape.kind == "capsule":
-                link.add_capsule_collision(pose, *shape.size, material)
-            else:
-                link.add_cylinder_collision(pose, *shape.size, material)
+            size = [list(shape.size)] if shape.kind == "box" else shape.size
+            getattr(link, f"add_{shape.kind}_collision")(pose, *size, material)
 
     def _after_loading_articulation(self) -> None:
         for name, contact in self.description.contacts.items():
