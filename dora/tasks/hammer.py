@@ -106,7 +106,7 @@ def _axes(s: HammerSnapshot) -> Tensor:
 
 
 def _nail_depths(s: HammerSnapshot) -> Tensor:
-    return torch.stack([s.nail_depth, s.nail_driven], -1) * 1000
+    return torch.stack([s.nail_depth, s.nail_driven], -1) * 100
 
 
 def _drifts(s: HammerSnapshot) -> Tensor:
@@ -116,7 +116,7 @@ def _drifts(s: HammerSnapshot) -> Tensor:
 OBSERVATIONS: dict[str, Entry] = {
     "length": Entry(lambda s: s.object_half[:, 2:], "m", "half length of the hammer"),
     "nail": Entry(nail_in_hand, "m", "the nail's head in the hand frame"),
-    "nail_depth": Entry(_nail_depths, "mm", "depth of the nail, and what of it was driven by blows"),
+    "nail_depth": Entry(_nail_depths, "cm", "depth of the nail, and what of it was driven by blows"),
     "drift": Entry(_drifts, "dm, rad", "motion of the hammer in the hand within 10 steps"),
     "handle": Entry(tip_distance, "m", "distance of each fingertip's surface from the handle's", True),
     "face": Entry(face_to_nail, "m", "striking face to the nail's head, world frame", True),

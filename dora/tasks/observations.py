@@ -16,6 +16,9 @@ from dora.robot.rotations import (
 from dora.tasks.options import OBSERVATION, PRIOR
 from dora.tasks.snapshot import Snapshot, goal_error, in_wrist, lifted, near_errors, turned_in_wrist
 
+FASTEST_SPIN = 30.0
+"""Spin of an object that is still told apart, about each axis [rad/s]; a slender one that is hit spins faster."""
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -39,6 +42,10 @@ class Entry:
     def exists(self, parts: frozenset[str]) -> bool:
         """Whether the entry exists with these parts of guidance."""
         return not self.guided or (PRIOR if self.prior else OBSERVATION) in parts
+
+
+def _object_spin(s: Snapshot) -> Tensor:
+    return turned_in_wrist(s, s.object_w).clamp(-FASTEST_SPIN, FASTEST_SPIN)
 
 
 def _axes(q: Tensor) -> Tensor:
@@ -75,7 +82,7 @@ OBSERVATIONS: dict[str, Entry] = {
     "object_p": Entry(lambda s: in_wrist(s, s.object_p), "m", "object position in the hand frame"),
     "object_R": Entry(_object_turn, "1", "object orientation in the hand frame, two columns of its matrix"),
     "object_v": Entry(lambda s: turned_in_wrist(s, s.object_v), "m/s", "object velocity in the hand's axes"),
-    "object_w": Entry(lambda s: turned_in_wrist(s, s.object_w), "rad/s", "object spin in the hand's axes"),
+    "object_w": Entry(_object_spin, "rad/s", f"object spin in the hand's axes, clipped at {FASTEST_SPIN:g}"),
     "object_rise": Entry(lambda s: lifted(s)[:, None], "m", "height of the object above its start"),
     "touch": Entry(lambda s: s.touch.float(), "1", "contact of thumb, index, middle, ring, pinky, palm"),
     "deepest": Entry(lambda s: s.deepest[:, None] * 1000, "mm", "deepest penetration of the episode so far"),
