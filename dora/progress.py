@@ -56,7 +56,8 @@ class PhaseProgress:
             rate = done / max(time.monotonic() - start, 1e-9)
             text = f"{scale * rate:,.3g} {unit}/s"
             self._bar.update(task, completed=done, total=total, rate=text)
-            self._line(f"{name}: {done}/{total}, {text}, ETA {(total - done) / max(rate, 1e-9):.0f} s")
+            left = f"{(total - done) / rate:.0f} s" if rate > 0 else "unknown"
+            self._line(f"{name}: {done}/{total}, {text}, ETA {left}")
 
         return update
 

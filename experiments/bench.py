@@ -8,8 +8,10 @@ import tyro
 
 from dora.affordance import benchmark as grasp_benchmark
 from dora.errors import InputError
+from dora.progress import PhaseProgress
 from dora.robot import load_robot
 from dora.sim import benchmark
+from dora.tasks import physics as task_physics
 
 app = tyro.extras.SubcommandApp()
 
@@ -44,6 +46,40 @@ def bench_grasp(object: str = "cube", robot: str = "diana7_hit", json: bool = Fa
         json: print one JSON object on the last line instead of a table.
     """
     report(dataclasses.asdict(grasp_benchmark.measure(object, load_robot(robot))), json)
+
+
+PHYSICS = ("120:10:8", "240:2:8", "240:3:6", "240:5:4", "240:5:8", "240:10:4", "240:10:8", "240:10:15", "480:10:8")
+
+
+@app.command(name="physics")
+def bench_physics(
+    env: str = "DoraHammer-v1",
+    settings: tuple[str, ...] = PHYSICS,
+    starts: int = 64,
+    preset: str = "none",
+    json: bool = False,
+) -> None:
+    """What a task's scripted solution makes of other physics settings: success, overlaps, tunnelling, time.
+
+    Args:
+        env: a Dora id.
+        settings: FREQUENCY:OFFSET:ITERATIONS each, in Hz, mm, and position iterations of the solver.
+        starts: initial states, the same for all settings.
+        preset: how much they are randomised.
+        json: print one JSON object on the last line instead of a table.
+    """
+    asked = [task_physics.parse_physics(text) for text in settings]
+    with PhaseProgress() as progress:
+        update = progress.phase(f"physics of {env}", "settings")
+        rows = task_physics.measure_physics(env, asked, starts, preset, progress=update)
+    flat = [dataclasses.asdict(row.physics) | dataclasses.asdict(row) for row in rows]
+    flat = [{k: v for k, v in row.items() if k != "physics"} for row in flat]
+    if json:
+        report({"env": env, "starts": starts, "preset": preset, "rows": flat}, True)
+        return
+    print("".join(f"{name:>20}" for name in flat[0]))
+    for row in flat:
+        print("".join(f"{value:20.4g}" for value in row.values()))
 
 
 def report(result: dict, as_json: bool) -> None:

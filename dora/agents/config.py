@@ -29,12 +29,12 @@ class PPOConfig:
     """Half width of the trust interval of the probability ratio."""
     entropy: float = 1e-3
     """Weight of the entropy bonus."""
-    value: float = 0.1
+    value: float = 1.0
     """Weight of the value loss."""
     bound: float = 5e-3
     """Weight of the penalty on mean actions outside [-1, 1]."""
     grad_norm: float = 1.0
-    """Gradients are scaled down to this norm."""
+    """The gradients of actor and critic are each scaled down to this norm."""
     learning_rate: float = 5e-4
     """First learning rate of Adam."""
     learning_rate_min: float = 1e-4

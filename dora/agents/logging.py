@@ -26,7 +26,7 @@ TAGS: dict[str, str] = {
     "learner/kl": "PPO: divergence from the policy that collected the batch, last epoch, nats",
     "learner/clip_fraction": "PPO: share of transitions whose probability ratio is clipped",
     "learner/learning_rate": "learning rate (PPO adapts it to the divergence)",
-    "learner/grad_norm": "norm of the gradient before clipping",
+    "learner/grad_norm": "norm of the gradient before clipping (of the actor)",
     "learner/action_std": "mean standard deviation of the exploration noise (SAC: before the tanh)",
     "learner/correction": "SAC: root mean square of the mean action over the batch",
     "learner/explained_variance": "PPO: 1 - Var(target - value) / Var(target); 1 is perfect",

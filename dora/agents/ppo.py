@@ -21,6 +21,9 @@ ADVANTAGE_FLOOR = 1e-6  # smallest standard deviation by which advantages are di
 class PPO:
     """Learns from one batch of fresh transitions at a time.
 
+    Values are discounted mean rewards, (1 - gamma) times the usual ones, and the gradients of actor and critic are
+    clipped apart: errors of the value, large at first, would otherwise scale the actor's steps down.
+
     The learning rate falls by 1.3 when the divergence from the old policy exceeds twice its target and
     rises by 1.2 when it is below half of it.
     """
@@ -47,8 +50,8 @@ class PPO:
         )
         self._mean = torch.empty(0)  # mean actions of the latest forward pass
         self.actor.register_forward_hook(self._keep_mean)
-        self.parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate, eps=ADAM_EPSILON)
+        parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        self.optimiser = torch.optim.Adam(parameters, lr=self.learning_rate, eps=ADAM_EPSILON)
 
     @property
     def modules(self) -> dict[str, nn.Module]:
@@ -114,7 +117,7 @@ class PPO:
             self.config.gae_lambda,
             value,
             next_value,
-            batch["next", "reward"],
+            batch["next", "reward"] * (1 - self.config.gamma),
             batch["next", "done"],
             batch["next", "terminated"],
         )
@@ -140,7 +143,8 @@ class PPO:
         total = out["loss_objective"] + out["loss_entropy"] + out["loss_critic"] + self.config.bound * bound
         self.optimiser.zero_grad()
         total.backward()
-        norm = nn.utils.clip_grad_norm_(self.parameters, self.config.grad_norm)
+        norm = nn.utils.clip_grad_norm_(self.actor.parameters(), self.config.grad_norm)
+        nn.utils.clip_grad_norm_(self.critic.parameters(), self.config.grad_norm)
         self.optimiser.step()
         with torch.no_grad():
             self.actor.log_std.clamp_(self.config.log_std_min, 0.0)

@@ -41,7 +41,7 @@ class ProgressReport:
         now = time.monotonic()
         if not self.console.is_terminal and now >= self._next_line:
             self._next_line = now + LINE_SECONDS
-            left = (self.total - steps) / rate if rate > 0 else 0.0
+            left = max(0, self.total - steps) / rate if rate > 0 else 0.0
             self.say(f"{status}  ETA {left:.0f} s")
 
     def say(self, text: str) -> None:

@@ -175,7 +175,7 @@ class DoraEnv(BuiltEnv):
             action = self.disturbances.delayed(action, step)
         self._push(self.disturbances.pushes(step))
         super()._step_action(None if action is None else self._command(action))
-        seen = self.CONTROL_FREQUENCY if self.CONTACT_EVERY_STEP else self.PHYSICS_FREQUENCY
+        seen = self.control_freq if self.CONTACT_EVERY_STEP else self.sim_freq
         self.episode.record_contacts(self._reader.contacts(), seen)
         if self.CONTACT_POINTS:
             self.episode.record_points(*self._reader.points())

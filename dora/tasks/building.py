@@ -31,6 +31,9 @@ from dora.tasks.reading import SimulatorReader
 from dora.tasks.reference import Reference
 from dora.tasks.scene import add_table
 
+SCALE_DRAW = 256
+"""Which number of an environment's stream is its size: episodes begin with the same numbers, and use fewer."""
+
 
 class BuiltEnv(JudgedEnv):
     """A task's options and scene: robot, table, object, candidates, and the readers of all that.
@@ -186,7 +189,7 @@ class BuiltEnv(JudgedEnv):
 
     def _draw_scale(self) -> Tensor:
         """(n,) relative sizes, one draw from each environment's own stream."""
-        share = np.asarray(self._batched_episode_rng.uniform(size=(1,))).reshape(-1)
+        share = np.asarray(self._batched_episode_rng.uniform(size=(SCALE_DRAW,)))[..., -1].reshape(-1)
         return torch.tensor(1 + self.preset.size * (2 * share - 1), dtype=torch.float32, device=self.device)
 
     @property

@@ -193,10 +193,10 @@ class HammerEnv(DoraEnv):
         }
         self.object_half = factor * torch.tensor(hammer.mesh.extents / 2, dtype=torch.float32, device=self.device)
         actor = build_object(
-            self.scene, hammer, scale=scale, friction=FRICTION, contact_offset=self.CONTACT_OFFSET,
+            self.scene, hammer, scale=scale, friction=FRICTION, contact_offset=self.sim_config.scene_config.contact_offset,
             pose=sapien.Pose([*RELEASE[:2], RELEASE[2] + 0.5]),
         )  # fmt: skip
-        self.nail = Nail(self.scene, NAIL_TOP, 1 / self.PHYSICS_FREQUENCY)
+        self.nail = Nail(self.scene, NAIL_TOP, 1 / self.sim_freq)
         self.nail.strike_with(actor, self._points["face"].cpu().numpy())
         self._history = torch.zeros(self.num_envs, WINDOW + 1, 7, device=self.device)
         return actor

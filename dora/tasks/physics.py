@@ -1,0 +1,118 @@
+"""What a task's scripted solution makes of other physics settings: success, overlaps, tunnelling and cost."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from mani_skill.utils.registration import REGISTERED_ENVS
+
+from dora.errors import InputError
+from dora.tasks import check_task_id, make_task
+from dora.tasks.base import DoraEnv
+
+TUNNELLED = 0.010
+"""Overlap at which a body is more inside another one than outside: about the radius of a finger or a handle [m]."""
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Settings of the simulation: steps per second [Hz], contact offset [m], position iterations of the solver."""
+
+    frequency: int
+    contact_offset: float
+    iterations: int
+
+
+@dataclass(frozen=True)
+class PhysicsRow:
+    """Outcome of one `Physics`.
+
+    Attributes:
+        physics: the settings.
+        success: share of the starts that succeed.
+        stages: mean number of stages done.
+        overlap_median_mm, overlap_p95_mm: deepest overlap of an episode [mm], over the starts.
+        tunnelled: share of starts with an overlap of more than 10 mm.
+        microseconds: processor time of one control step of one environment [us].
+    """
+
+    physics: Physics
+    success: float
+    stages: float
+    overlap_median_mm: float
+    overlap_p95_mm: float
+    tunnelled: float
+    microseconds: float
+
+
+def parse_physics(text: str) -> Physics:
+    """Settings from `FREQUENCY:OFFSET:ITERATIONS`, in Hz, mm and a number; raises InputError."""
+    try:
+        frequency, offset, iterations = text.split(":")
+        physics = Physics(int(frequency), float(offset) / 1000, int(iterations))
+    except ValueError:
+        raise InputError(f"{text!r} is not FREQUENCY:OFFSET_MM:ITERATIONS, such as 240:10:8") from None
+    if min(physics.frequency, physics.contact_offset, physics.iterations) <= 0:
+        raise InputError(f"{text!r} has a number that is not above zero")
+    return physics
+
+
+def measure_physics(
+    env_id: str,
+    settings: Sequence[Physics],
+    starts: int = 64,
+    preset: str = "none",
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[PhysicsRow]:
+    """Executes the uncorrected reference from the same starts under each of the settings.
+
+    Args:
+        env_id: a Dora id.
+        settings: what to compare; frequencies must be multiples of the task's control frequency.
+        starts: initial states, executed in one batch.
+        preset: how much they are randomised.
+        seed: of the initial states.
+        progress: called with the settings done and their number.
+
+    Raises:
+        InputError: for an unknown id or preset, no start, or a frequency that is no multiple of the control's.
+    """
+    if starts < 1:
+        raise InputError(f"physics is compared on at least one start, not {starts}")
+    check_task_id(env_id)
+    control = cast(type[DoraEnv], REGISTERED_ENVS[env_id].cls).CONTROL_FREQUENCY
+    for physics in settings:
+        if physics.frequency % control:
+            raise InputError(
+                f"{physics.frequency} Hz is no multiple of the {control} Hz at which {env_id} is controlled"
+            )
+    rows = []
+    for physics in settings:
+        progress(len(rows), len(settings))
+        rows.append(_executed(env_id, physics, starts, preset, seed))
+    progress(len(rows), len(settings))
+    return rows
+
+
+def _executed(env_id: str, physics: Physics, starts: int, preset: str, seed: int) -> PhysicsRow:
+    scene = {"contact_offset": physics.contact_offset, "solver_position_iterations": physics.iterations}
+    config = {"sim_freq": physics.frequency, "scene_config": scene}
+    task = make_task(env_id, starts, preset=preset, sim_config=config)
+    try:
+        task.reset(seed=seed)
+        action, success, stage = torch.zeros(starts, task.action_size), torch.zeros(0), torch.zeros(0)
+        begun = time.process_time()
+        for _ in range(task.max_steps):
+            info = task.step(action)[-1]
+            success, stage = info["success"].float(), info["stage"].float()
+        spent = time.process_time() - begun
+        deepest = task.snapshot.deepest
+    finally:
+        task.close()
+    median, high = (1000 * deepest.quantile(q).item() for q in (0.5, 0.95))
+    tunnelled = (deepest > TUNNELLED).float().mean().item()
+    cost = 1e6 * spent / (starts * task.max_steps)
+    return PhysicsRow(physics, success.mean().item(), stage.mean().item(), median, high, tunnelled, cost)
