@@ -115,3 +115,12 @@ def test_the_cube_survives_a_shake(held: tasks.DoraEnv):
     print(f"wrist moved {travel.mean() * 1000:.1f} mm rms; held {(lowest > 0.08).float().mean():.2f}")
     assert travel.min() > 0.003  # it was a shake
     assert (lowest[ready] > 0.08).float().mean() >= 0.95
+
+
+def test_size_and_place_are_drawn_apart():
+    task = tasks.make_task("DoraCube-v1", 48)
+    task.reset(seed=list(range(48)))
+    drawn = torch.cat([task.scale[:, None], task.target_object.pose.p[:, :2], task.episode.mass[:, None]], 1)
+    correlation = torch.corrcoef(drawn.T)[0, 1:3]
+    assert correlation.abs().max() < 0.5
+    task.close()

@@ -176,7 +176,7 @@ def _clean(s: Snapshot) -> Tensor:
 
 
 def _tilt(s: Snapshot) -> Tensor:
-    return (1 - uprightness(s)).clamp(0, 1)
+    return (uprightness(s).clamp(-1, 1).acos() / UPRIGHT).clamp(0, 1)
 
 
 TERMS: Terms[Snapshot] = Terms(
@@ -196,7 +196,7 @@ TERMS: Terms[Snapshot] = Terms(
         "grasp": Term(grip, 0.4, doc="contacts: thumb against a finger, and how many fingers"),
         "lift": Term(_lift, 3.0, doc="rise, saturating at the target height, less if tilted"),
         "held": Term(_clean, 1.5, doc="lifted, upright, opposed, off the table, no overlap above 5 mm so far"),
-        "tilt": Term(_tilt, -0.3, "penalty", doc="1 - cosine of the tilt"),
+        "tilt": Term(_tilt, -1.0, "penalty", doc="tilt, as a share of the largest that counts as lifted"),
         **penalties(0.001, DEEPEST),
     }
 )
