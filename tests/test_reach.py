@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from dora.affordance import servo
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.collision import CollisionModel
 from dora.affordance.extent import ArmExtent, HandExtent
@@ -25,6 +26,9 @@ from dora.robot.rotations import (
     quaternion_multiply,
     rotation_vector_from_matrix,
 )
+from dora.sim import controllers
+from dora.tasks import guidance
+from dora.tasks.building import BuiltEnv
 
 GRASPED = (0.06, 0.006, 0.12)
 """Middle of what a hand holds, in the wrist frame [m]."""
@@ -287,10 +291,10 @@ def test_exactness_only_removes(robot):
 def test_a_plan_leads_where_the_wrist_controller_does_not(robot):
     cube = load_object("cube")
     candidates, poses = clear_grasps(robot, cube, 12), scattered(cube, 3)
-    servo, planned = (
+    driven, planned = (
         Reach(robot, cube, settings=ReachSettings(motion=m)).filter(candidates, *poses) for m in ("servo", "plan")
     )
-    stuck = servo.reason == NO_MOTION
+    stuck = driven.reason == NO_MOTION
     assert stuck.any()
     assert planned.reachable[stuck].any()
 
@@ -379,3 +383,12 @@ def test_the_table_is_kept_and_guarded(tabled, robot, monkeypatch):
 def test_a_grid_without_places_is_refused():
     with pytest.raises(InputError, match="grid"):
         Grid((0.0, 0.0), (0.1, 0.1), spacing=0.0)
+
+
+def test_the_servo_has_the_numbers_of_the_tasks():
+    """`dora.affordance` may not import the tasks, so the numbers stand in both."""
+    assert 1 / servo.PERIOD == BuiltEnv.CONTROL_FREQUENCY
+    assert (servo.WRIST_SPEED, servo.WRIST_SPIN) == (controllers.WRIST_SPEED, controllers.WRIST_SPIN)
+    assert servo.LIMIT_MARGIN == controllers.LIMIT_MARGIN
+    assert (servo.DESCENT, servo.ARRIVED) == (guidance.DESCENT, guidance.ARRIVED)
+    assert tuple(x / 2 for x in guidance.SETTLED) == servo.SETTLED

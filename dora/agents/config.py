@@ -37,7 +37,7 @@ class PPOConfig:
     """The gradients of actor and critic are each scaled down to this norm."""
     learning_rate: float = 5e-4
     """First learning rate of Adam."""
-    learning_rate_min: float = 1e-4
+    learning_rate_min: float = 1e-5
     """Smallest learning rate that the adaptation chooses."""
     learning_rate_max: float = 1e-3
     """Largest learning rate that the adaptation chooses."""
