@@ -96,7 +96,7 @@ class Rollouts:
                 functools.partial(_make_worker_env, make_task, report, seed, stagger)
                 for report, seed in zip(self._reports, seeds, strict=True)
             ]
-            with _sigint_blocked(), self._explained():
+            with sigint_blocked(), self._explained():
                 self._collector = MultiSyncCollector(
                     factories,
                     policy,
@@ -153,7 +153,7 @@ class Rollouts:
 
 
 @contextmanager
-def _sigint_blocked() -> Iterator[None]:
+def sigint_blocked() -> Iterator[None]:
     """Block Ctrl-C while workers start: they keep the mask for good, this process gets the signal later."""
     resource_tracker.ensure_running()  # unblocks SIGINT itself when it starts
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

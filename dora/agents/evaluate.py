@@ -75,22 +75,29 @@ class Evaluation:
 
 
 @torch.no_grad()
+def run_batch(env: TaskEnv, act: Act, first_seed: int) -> Float[Tensor, "n k"]:
+    """One episode per environment, with seeds first_seed, first_seed + 1, ...; their rows of an evaluation's table.
+
+    Rows that end early idle until all end.
+    """
+    n = env.batch_size[0]
+    data = env.restart([first_seed + row for row in range(n)])
+    table = torch.zeros_like(data["statistics"])
+    running = torch.ones(n, dtype=torch.bool)
+    while running.any():
+        action = act(data["observation"])
+        data = env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
+        ended = running & data["done"][:, 0]
+        table[ended] = data["statistics"][ended]
+        running &= ~ended
+    return table
+
+
 def evaluate(env: TaskEnv, act: Act, episodes: int, first_seed: int) -> Evaluation:
     """Run `episodes` episodes with seeds first_seed, first_seed + 1, ...
 
-    Episode i has the same seed whatever the number of environments. Rows that end early idle until all end.
+    Episode i has the same seed whatever the number of environments.
     """
-    tables: list[Tensor] = []
-    n = env.batch_size[0]
-    for start in range(0, episodes, n):
-        data = env.restart([first_seed + start + row for row in range(n)])
-        table = torch.zeros_like(data["statistics"])
-        running = torch.ones(n, dtype=torch.bool)
-        while running.any():
-            action = act(data["observation"])
-            data = env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
-            ended = running & data["done"][:, 0]
-            table[ended] = data["statistics"][ended]
-            running &= ~ended
-        tables.append(table[: episodes - start])
-    return Evaluation(env.columns, torch.cat(tables))
+    starts = range(0, episodes, env.batch_size[0])
+    tables = [run_batch(env, act, first_seed + start) for start in starts]
+    return Evaluation(env.columns, torch.cat(tables)[:episodes])

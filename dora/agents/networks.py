@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 CLIP = 6.0  # normalised observations stay within this many standard deviations
 VARIANCE_FLOOR = 1e-4  # keeps components that never change finite
-FIRST_OUTPUT_SCALE = 0.05  # shrinks the last layer of a new actor, so that it starts near zero correction
+FIRST_OUTPUT_SCALE = 0.05  # shrinks the last layer: a new actor corrects nothing, a new critic has no opinion
 LOG_STD_MIN = -4.0  # smallest state-dependent log standard deviation, before the tanh
 LOG_STD_START = 2.0  # output of a new actor that stands for a log standard deviation 0.13 below its bound
 TANH_MARGIN = 1e-6  # keeps log(1 - tanh^2) finite
@@ -145,6 +145,7 @@ class Critic(nn.Module):
     def __init__(self, size: int, hidden: Sequence[int], activation: type[nn.Module], layer_norm: bool):
         super().__init__()
         self.net = mlp((size, *hidden, 1), activation, layer_norm)
+        _start_near_zero(self.net)
 
     def forward(self, *inputs: Float[Tensor, "*n _"]) -> Float[Tensor, "*n 1"]:
         """The value, in units of reward."""

@@ -24,8 +24,9 @@ from dora.agents.checkpoint import (
 )
 from dora.agents.collect import Rollouts
 from dora.agents.config import RunConfig
-from dora.agents.env import EpisodeColumns, Task, TaskEnv, ended_episodes
-from dora.agents.evaluate import FINAL_SEED, PERIODIC_SEED, Evaluation, evaluate, no_correction
+from dora.agents.env import EpisodeColumns, Task, ended_episodes
+from dora.agents.evaluate import FINAL_SEED, PERIODIC_SEED, Evaluation
+from dora.agents.evaluators import Evaluators
 from dora.agents.interrupt import Interrupt
 from dora.agents.learner import Learner, make_learner
 from dora.agents.logging import RunLog
@@ -78,12 +79,9 @@ class Trainer:
         self.config, self.make_task, self.folder = config, make_task, folder
         torch.set_num_threads(config.learner_threads)
         self.counters = Counters(next_evaluation=config.eval_every)
-        self._evaluation_env = TaskEnv(make_task(config.eval_envs))
-        self.columns: EpisodeColumns = self._evaluation_env.columns
-        self.sizes = (
-            self._evaluation_env.observation_spec["observation"].shape[-1],
-            self._evaluation_env.action_spec.shape[-1],
-        )
+        self._evaluators = Evaluators(functools.partial(make_task, config.eval_envs), config)
+        self.columns: EpisodeColumns = self._evaluators.env.columns
+        self.sizes = self._evaluators.sizes
         weights_seed, self._exploration_seed = seeds_for(config.seed, 0, 2)
         torch.manual_seed(weights_seed)
         self.learner: Learner = make_learner(config, *self.sizes)
@@ -114,7 +112,7 @@ class Trainer:
                 evaluation, zero = self._last_evaluation, None
             finally:
                 log.close()
-                self._evaluation_env.close()
+                self._evaluators.close()
         result = make_result(
             self.config,
             env_steps=self.counters.env_steps,
@@ -206,7 +204,7 @@ class Trainer:
         """Evaluate, keep the policy if it is the best so far, and tell whether the run may end."""
         counters, config = self.counters, self.config
         start = time.perf_counter()
-        evaluation = self._run_evaluation(config.eval_episodes, PERIODIC_SEED, self._greedy, interrupt)
+        evaluation = self._evaluators.run(self.learner.policy, config.eval_episodes, PERIODIC_SEED, interrupt.check)
         self._spend("evaluate", time.perf_counter() - start)
         while counters.next_evaluation <= counters.env_steps:
             counters.next_evaluation += config.eval_every
@@ -232,23 +230,6 @@ class Trainer:
         counters.reached = counters.reached + 1 if reached else 0
         return counters.reached >= 2
 
-    def _greedy(self, observation: Float[Tensor, "n o"]) -> Float[Tensor, "n a"]:
-        return self.learner.policy.greedy(observation)
-
-    def _run_evaluation(
-        self,
-        episodes: int,
-        first_seed: int,
-        act: Callable[[Tensor], Tensor],
-        interrupt: Interrupt,
-    ) -> Evaluation:
-        def checked(observation: Tensor) -> Tensor:
-            interrupt.check()
-            return act(observation)
-
-        with torch.random.fork_rng(devices=[]):
-            return evaluate(self._evaluation_env, checked, episodes, first_seed)
-
     def _final_evaluation(self, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
         """Evaluate the best policy, and no correction, on seeds that chose nothing."""
         start = time.perf_counter()
@@ -258,10 +239,10 @@ class Trainer:
         else:
             self._checkpoint(pack_modules(self.learner.modules)).write(self.folder.best)
         episodes = self.config.final_episodes
-        evaluation = self._run_evaluation(episodes, FINAL_SEED, self._greedy, interrupt)
+        evaluation = self._evaluators.run(self.learner.policy, episodes, FINAL_SEED, interrupt.check)
         zero = None
         if self.config.has_prior:
-            zero = self._run_evaluation(episodes, FINAL_SEED, no_correction(self.sizes[1]), interrupt)
+            zero = self._evaluators.run(None, episodes, FINAL_SEED, interrupt.check)
         self._spend("evaluate", time.perf_counter() - start)
         return evaluation, zero
 
