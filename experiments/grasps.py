@@ -21,7 +21,7 @@ from dora.errors import InputError
 from dora.progress import PhaseProgress
 from dora.robot import load_robot
 from dora.sim.grasp_report import check_out, print_report, write_report
-from dora.sim.grasps import baselines, generate, summary
+from dora.sim.grasps import baselines, by_region, generate, summary, voting_summary
 from dora.sim.shipping import ship
 from dora.tasks.proving import TASKS, prove_shipped
 
@@ -58,6 +58,9 @@ class Args:
     """Close the hand and pull along six directions in SAPIEN, or only measure penetration."""
     baselines: int = 64
     """Candidates of each baseline; 0 leaves the baselines out."""
+    by_region: int = 0
+    """Candidates of a search for each other region and of a free one, simulated as well: how often each region is held
+    with and without asking for it, and how well the vote tells (needs --validate sapien)."""
     ship: bool = False
     """Make the set that comes with Dora for --object instead: enough valid grasps, ranked by simulated lifts; then
     what --prove does, where the object has a task with a table."""
@@ -71,6 +74,8 @@ def target(args: Args) -> tuple[AffordanceObject, str | None]:
         raise InputError("Give either --object or --mesh, for example --object jug.")
     if args.num < 1 or args.baselines < 0:
         raise InputError(f"--num is {args.num} and --baselines {args.baselines}: at least 1 and 0 are needed.")
+    if args.by_region < 0 or (args.by_region and args.validate == "none"):
+        raise InputError(f"--by-region is {args.by_region}: give a positive number, and --validate sapien with it.")
     if args.object is not None:
         if args.labels is not None or args.scale != 1 or args.units != "m":
             raise InputError("--labels, --scale and --units belong to --mesh: leave them out with --object.")
@@ -99,6 +104,12 @@ def run(args: Args) -> None:
     with PhaseProgress() as phases:
         generated = generate(obj, robot, args.num, args.seed, region, phases, simulate)
         report = summary(generated)
+        searches = {}
+        if args.by_region:
+            searches = by_region(obj, robot, args.by_region, args.seed, region, phases)
+            report["by_region"] = {name: summary(found) for name, found in searches.items()}
+        if simulate:
+            report["voting"] = voting_summary([generated, *searches.values()], obj)
         if args.baselines:
             report["baselines"] = baselines(obj, robot, args.baselines, args.seed, region, phases, simulate)
     print_report(report)

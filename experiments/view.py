@@ -4,6 +4,7 @@
     python experiments/view.py runs/grasps/jug.safetensors          # what experiments/grasps.py wrote
     python experiments/view.py mug.glb --labels mug.yaml            # the regions of your own mesh
     python experiments/view.py runs/grasps/mug.safetensors --mesh mug.glb --labels mug.yaml
+    python experiments/view.py jug --pictures runs/pictures         # PNG files instead of a page
 
 Runs until Ctrl-C.
 """
@@ -16,6 +17,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from dora.affordance.album import write_album
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.importing import import_object
 from dora.affordance.objects import available_objects, load_object
@@ -47,6 +49,8 @@ class Args:
     """Factor of all lengths of --mesh."""
     units: Literal["m", "cm", "mm", "in"] = "m"
     """Unit of length of --mesh; GLB files are in metres."""
+    pictures: Path | None = None
+    """Folder: write PNGs of regions, of four grasps and of their contact semantic maps there, and serve no page."""
     robot: str = "diana7_hit"
     """Robot whose hand is shown: a folder name in robots/ or a path."""
 
@@ -77,6 +81,9 @@ def main() -> int:
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     try:
         obj, candidates = content(args)
+        if args.pictures is not None:
+            print(*write_album(obj, candidates, load_robot(args.robot), args.pictures), sep="\n")
+            return 0
         page = GraspPage(obj, candidates, load_robot(args.robot), args.port, args.host)
     except InputError as error:
         print(error, file=sys.stderr)

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import ModuleType
 
 import mani_skill
+import numpy as np
 import pytest
 import torch
 from commands import call, load_command
@@ -13,13 +14,14 @@ from commands import call, load_command
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.objects import load_object
 from dora.affordance.optimise import Settings
+from dora.affordance.protocol import STANDARD
 from dora.affordance.shipped import shipped_path
 from dora.progress import PhaseProgress
 from dora.robot import load_robot
 from dora.sim import grasps
 from dora.sim.validation import Reason, Validation
 
-ASSETS = Path(mani_skill.__file__).parent / "assets"
+PACKAGE = Path(mani_skill.__file__).parent
 KEYS = {
     "object", "robot", "requested", "optimised", "valid", "valid_per_second", "optimise_seconds", "sim_success_rate",
     "penetration_mm", "classes", "energy", "digest",
@@ -39,6 +41,8 @@ def script() -> ModuleType:
         ("--object jug --mesh a.stl", "--object or --mesh"),
         ("--object jug --num 0", "--num is 0"),
         ("--object jug --baselines -1", "--baselines -1"),
+        ("--object jug --by-region -1", "--by-region is -1"),
+        ("--object jug --by-region 8", "--validate sapien with it"),
         ("--object jug --region spoon", "no region 'spoon'"),
         ("--object jug --scale 2", "belong to --mesh"),
         ("--object jug --out a.json", "ends in .safetensors"),
@@ -123,6 +127,7 @@ def test_validity_is_that_of_the_simulation(monkeypatch: pytest.MonkeyPatch):
             reason=torch.where(passed == 1, int(Reason.PASSED), int(Reason.SLIPPED)),
             displacement=zeros, closing_shift=zeros + 0.03 * (torch.arange(len(candidates)) == 1), penetration=zeros,
             part_force=torch.zeros(len(candidates), 6), label_force=torch.zeros(len(candidates), 1),
+            contacts=candidates.contacts, contact_finger=candidates.contact_finger,
             candidate_penetration=zeros + 0.003 * (torch.arange(len(candidates)) == 3),
             self_penetration=zeros, protocol=protocol,
         )  # fmt: skip
@@ -139,6 +144,59 @@ def test_validity_is_that_of_the_simulation(monkeypatch: pytest.MonkeyPatch):
     assert report["valid_per_second"] == pytest.approx(2 / seconds)
 
 
+def at_handle_and_body(candidates: GraspCandidates, robot: object, protocol: object, progress: object) -> Validation:
+    """A verdict by which grasps in turn close upon handle and body, whatever they touched before, all validly."""
+    jug, count = load_object("jug"), len(candidates)
+    by_handle = torch.arange(count) % 2 == 0
+    outer = jug.mesh.vertices[jug.mesh.vertices[:, 0].argmax()]  # of the handle
+    places = torch.tensor(np.stack([jug.centroid("body"), outer])).float()
+    force = torch.zeros(count, len(jug.labels))
+    force[by_handle, jug.label_index("handle")] = 5.0
+    force[~by_handle, jug.label_index("body")] = 5.0
+    force[:2] += 4.0  # not clearly held
+    zeros = torch.zeros(count)
+    return Validation(
+        reason=torch.full((count,), int(Reason.PASSED)), displacement=zeros, closing_shift=zeros, penetration=zeros,
+        part_force=torch.zeros(count, 6), label_force=force,
+        contacts=places[by_handle.long()][:, None], contact_finger=torch.full((count, 1), 2),
+        candidate_penetration=zeros, self_penetration=zeros, protocol=STANDARD,
+    )  # fmt: skip
+
+
+def test_searches_by_region_and_the_votes(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    """12 grasps by the handle asked for, and as many of a free search, of the body's and of the rim's."""
+    shipped = GraspCandidates.load(shipped_path("jug"))
+    asked = []
+
+    def search(obj, robot, num, seed, region, settings, progress) -> GraspCandidates:
+        asked.append((region, num))
+        return shipped.select(slice(num))
+
+    monkeypatch.setattr(grasps, "optimise", search)
+    monkeypatch.setattr(grasps, "validate", lambda c, obj, *rest, **named: at_handle_and_body(c, *rest, **named))
+    out = tmp_path / "jug.safetensors"
+    options = ("--object", "jug", "--num", "12", "--by-region", "8", "--baselines", "0", "--validate", "sapien")
+    assert call(script, monkeypatch, *options, "--out", str(out)) == 0
+    assert asked == [("handle", 12), (None, 8), ("body", 8), ("rim", 8)]
+    shown = capsys.readouterr().out
+    assert "balanced" in shown
+    report = json.loads(out.with_suffix(".json").read_text())
+    assert report["class_shares"] == {"HandleGrasp": 0.5, "BodyGrasp": 0.5}
+    assert list(report["by_region"]) == ["any", "body", "rim"]
+    assert GraspCandidates.load(out).grasp_class == ("HandleGrasp", "BodyGrasp") * 6
+    voting = report["voting"]
+    assert voting["labels"] == ["body", "handle", "rim"]
+    assert (voting["all"]["grasps"], voting["clear"]["grasps"]) == (36, 36 - 8)
+    for group, each in (("all", 18), ("clear", 14)):
+        closed, before = voting[group]["closed_hand"], voting[group]["candidate"]
+        assert closed["balanced_accuracy"] == 1
+        assert closed["confusion"] == [[each, 0, 0, 0], [0, each, 0, 0], [0, 0, 0, 0]]
+        assert before["balanced_accuracy"] == pytest.approx(0.5)  # the shipped ones touch the handle
+        assert before["recall"] == {"body": 0, "handle": 1}
+
+
 def test_the_digest_follows_object_robot_and_settings():
     path = shipped_path("cube")
     candidates = GraspCandidates.load(path)
@@ -148,12 +206,47 @@ def test_the_digest_follows_object_robot_and_settings():
         assert grasps.origin_digest(replace(candidates, **{name: "other"})) != digest
 
 
+FOREIGN = {
+    "assets/deformable_manipulation/beaker.glb": (
+        ("--scale", "0.04"),
+        {"plane": {"point": [0, 0, 1], "normal": [0, 0, 1]}},
+    ),
+    "envs/tasks/fmb/assets/purple_u.ply": ((), {"box": {"min": [-1, -1, -1], "max": [1, 0, 1]}}),
+}
+"""A laboratory beaker and a CAD part, which ManiSkill ships: options, and a region that they get here."""
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_labelled_meshes_by_others_go_all_the_way(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
+):
+    """Import, regions, search by region, simulation, files, and pictures of them, in a short search."""
+    monkeypatch.setenv("DORA_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(grasps, "Settings", lambda: QUICK)
+    options, shape = FOREIGN[name]
+    labels, out = tmp_path / "labels.yaml", tmp_path / "found.safetensors"
+    labels.write_text(json.dumps({"regions": {"grip": shape}}))
+    mesh = ("--mesh", str(PACKAGE / name), "--labels", str(labels), *options)
+    search = ("--region", "grip", "--num", "4", "--baselines", "0", "--validate", "sapien", "--out", str(out))
+    assert call(script, monkeypatch, *mesh, *search) == 0
+    report = json.loads(out.with_suffix(".json").read_text())
+    candidates = GraspCandidates.load(out)
+    assert (report["region"], report["optimised"], candidates.object) == ("grip", 4, Path(name).stem)
+    assert set(candidates.grasp_class) <= {"GripGrasp", "BodyGrasp"}
+    assert "GripGrasp" in candidates.grasp_class
+    assert set(report["voting"]["labels"]) == {"grip", "body"}
+    folder = tmp_path / "pictures"
+    assert call(load_command("view"), monkeypatch, str(out), *mesh, "--pictures", str(folder)) == 0
+    stem = Path(name).stem
+    assert {p.name for p in folder.iterdir()} == {f"{stem}-{what}.png" for what in ("map", "grasps", "contacts")}
+
+
 def test_a_mesh_from_elsewhere_goes_all_the_way(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ):
     """A bottle modelled by others (18 cm at this scale): import, search, simulation, files."""
     monkeypatch.setenv("DORA_CACHE", str(tmp_path / "cache"))
-    bottle = ASSETS / "deformable_manipulation" / "bottle.glb"
+    bottle = PACKAGE / "assets" / "deformable_manipulation" / "bottle.glb"
     out = tmp_path / "bottle.safetensors"
     options = ("--mesh", str(bottle), "--scale", "0.03", "--num", "8", "--baselines", "0", "--validate", "sapien")
     assert call(script, monkeypatch, *options, "--out", str(out)) == 0

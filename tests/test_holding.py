@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dora.affordance.compiled import CompiledEnergy
+from dora.affordance.contact_map import wrist_matrix
 from dora.affordance.hand import HandModel
 from dora.affordance.holding import Holding, hold
 from dora.affordance.objects import load_object
@@ -76,3 +77,15 @@ def test_the_model_is_repeatable(energy: CompiledEnergy):
     first, second = held(energy), held(energy)
     for a, b in zip(first, second, strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
+
+
+def test_the_best_are_the_same_when_others_are_given_up(energy: CompiledEnergy):
+    grasps = load_candidates("cube").select(slice(0, 96, 4))
+    wrist = wrist_matrix(grasps.position + torch.linspace(-0.02, 0.02, len(grasps))[:, None], grasps.quaternion)
+    postures = pregrasp(ROBOT, grasps.joints), squeeze(ROBOT, grasps.joints)
+    every, some = hold(energy, wrist, *postures, CUBE.mass), hold(energy, wrist, *postures, CUBE.mass, wanted=5)
+    best = every.quality.argsort(descending=True)[:5]
+    assert torch.equal(some.quality.argsort(descending=True)[:5], best)
+    torch.testing.assert_close(some.quality[best], every.quality[best], rtol=0, atol=0)
+    assert (some.quality >= every.quality).all()
+    assert (some.displacement < every.displacement - 1e-6).any()

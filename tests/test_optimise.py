@@ -7,13 +7,16 @@ import pytest
 import torch
 import trimesh
 
+from dora.affordance.compiled import CompiledDescent, CompiledEnergy
 from dora.affordance.contact_map import wrist_matrix
-from dora.affordance.energies import GraspEnergy
+from dora.affordance.descent import Descent, Schedule
+from dora.affordance.energies import GraspEnergy, Weights
 from dora.affordance.hand import HandModel
 from dora.affordance.importing import import_object
 from dora.affordance.initial import InitialPoses, Spread
 from dora.affordance.objects import load_object
 from dora.affordance.optimise import opened, optimise, table_of
+from dora.affordance.prepared import field_of, forget, hand_of
 from dora.affordance.protocol import STANDARD, pregrasp
 from dora.affordance.search import Search, Settings
 from dora.affordance.signed_distance import ExactDistance, SignedDistanceField
@@ -117,14 +120,72 @@ def test_settled_rows_leave_and_none_is_lost(robot):
     hand = HandModel(robot)
     cube = load_object("cube")
     settings = Settings(iterations=80, settle=0.1, field_size=1.0)
-    search = Search(
-        GraspEnergy(hand, SignedDistanceField(cube.solid)), InitialPoses(cube, hand, None, Spread()), settings
-    )
-    rows_per_step = []
-    rows = search.run(COUNT, torch.Generator().manual_seed(0), rows_per_step.append)
+    energy = CompiledEnergy(hand, SignedDistanceField(cube.solid))
+    search = Search(energy, InitialPoses(cube, hand, None, Spread()), settings)
+    done = []
+    rows = search.run(COUNT, torch.Generator().manual_seed(0), done.append)
     assert len(rows) == COUNT
-    assert len(rows_per_step) <= settings.iterations
-    assert rows_per_step == sorted(rows_per_step, reverse=True)
+    assert sum(done) < COUNT * settings.iterations
+
+
+@pytest.mark.parametrize("kind", [GraspEnergy, CompiledEnergy])
+def test_only_the_better_rows_stay(robot, kind):
+    hand = HandModel(robot)
+    cube = load_object("cube")
+    settings = Settings(iterations=4, starts=1, field_size=3.0)
+    search = Search(kind(hand, SignedDistanceField(cube.solid)), InitialPoses(cube, hand, None, Spread()), settings)
+    done = []
+    assert len(search.run(COUNT, torch.Generator().manual_seed(0), done.append)) == COUNT
+    assert sum(done) == 2 * 3 * COUNT + 2 * COUNT
+
+
+def test_compiled_descent_takes_the_steps_of_the_definition(robot):
+    hand = HandModel(robot)
+    cube = load_object("cube")
+    energy = CompiledEnergy(hand, SignedDistanceField(cube.solid), table=table_of(cube))
+    search = Search(energy, InitialPoses(cube, hand, None, Spread()), Settings())
+    start = search.start(COUNT, torch.Generator().manual_seed(0))
+    schedule = Schedule(3, [1.0, 2.0, 3.0], [1.0, 0.8, 0.6])
+    ends = []
+    for kind in (Descent, CompiledDescent):
+        rows = start.select(torch.arange(COUNT))
+        rows.mean += 0.1
+        rows.square += 10.0
+        kind(energy, search.descent.largest)(rows, schedule)
+        ends.append(rows)
+    for name in ("wrist", "joints", "mean", "square", "total", "overlap"):
+        torch.testing.assert_close(getattr(ends[1], name), getattr(ends[0], name), rtol=2e-3, atol=2e-5, msg=name)
+    assert not torch.equal(ends[1].wrist, start.wrist)
+
+
+def test_terms_without_weight_do_not_act_in_a_descent(robot):
+    hand = HandModel(robot)
+    cube = load_object("cube")
+    energy = CompiledEnergy(hand, SignedDistanceField(cube.solid), Weights(closure=0.0, closing=0.0))
+    rows = Search(energy, InitialPoses(cube, hand, None, Spread()), Settings()).start(
+        COUNT, torch.Generator().manual_seed(0)
+    )
+    found = energy(rows.wrist, rows.joints, rows.contacts)
+    assert (found.terms["closure"] > 0).any()
+    CompiledDescent(energy, torch.zeros(6 + rows.joints.shape[1]))(rows, Schedule(0, [1.0], [1.0]))
+    torch.testing.assert_close(rows.total, found.total)
+    torch.testing.assert_close(rows.mean, 0.1 * torch.cat((found.wrist, found.joints), 1), rtol=1e-4, atol=1e-3)
+
+
+def test_candidates_hardly_penetrate(robot):
+    found = optimise(load_object("cube"), robot, 32, seed=1, region="body")
+    assert found.penetration.quantile(0.9) < 1e-3
+    assert found.valid.all()
+
+
+def test_a_second_call_prepares_nothing_anew(robot):
+    cube = load_object("cube")
+    assert field_of(cube, None, "cpu") is field_of(cube, None, "cpu")
+    assert field_of(cube, "body", "cpu") is not field_of(cube, None, "cpu")
+    assert field_of(replace(cube), None, "cpu") is not field_of(cube, None, "cpu")
+    kept = hand_of(robot, "cpu")
+    forget()
+    assert hand_of(robot, "cpu") is not kept
 
 
 def test_an_imported_mesh_goes_through(robot, tmp_path):

@@ -151,6 +151,13 @@ def test_good_and_bad_grasps_end_as_they_must():
     assert found.touched[0].sum() >= 4
     assert found.held.tolist()[:2] == [0, -1]
     torch.testing.assert_close(found.label_force.sum(1), found.part_force.sum(1))
+    pressing = found.contact_finger > 0
+    assert [set(row[row > 0].tolist()) for row in found.contact_finger] == [
+        {part + 1 for part, touches in enumerate(row) if touches} for row in found.touched.tolist()
+    ]
+    beyond = found.contacts[pressing].abs().amax(1) - 0.03
+    assert float(beyond.abs().max()) < 2e-3  # on the cube's surface, in its frame, wherever closing moved it
+    assert not found.contacts[~pressing].any()
 
 
 def test_gravity_of_a_heavier_world_is_too_much():

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
@@ -17,6 +18,7 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from dora.affordance import viewing
+from dora.affordance.album import chosen
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand import HandModel
 from dora.affordance.hand_mesh import HandMesh
@@ -199,3 +201,28 @@ def test_bad_sources(
         error = capsys.readouterr().err
         assert words in error
         assert error.count("\n") == 1
+
+
+def test_pictures_instead_of_the_page(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    """Four grasps: every class is among them, and each part of the hand that touches has its colour."""
+    folder = tmp_path / "new" / "pictures"
+    assert call(script, monkeypatch, "jug", "--pictures", str(folder)) == 0
+    paths = [folder / f"jug-{what}.png" for what in ("map", "grasps", "contacts")]
+    assert capsys.readouterr().out.split() == [str(path) for path in paths]
+    touched, untouched = (imageio.imread(path)[..., :3].reshape(-1, 3) for path in (paths[2], paths[0]))
+    for part in ("palm", "thumb", "middle"):
+        near = np.abs(touched.astype(int) - np.array(PARTS[part])).max(1) < 40
+        assert near.sum() > 300, part
+    assert len(np.unique(untouched, axis=0)) > 100
+    (tmp_path / "file").write_text("")
+    assert call(script, monkeypatch, "jug", "--pictures", str(tmp_path / "file" / "x")) == 2
+    assert "choose another one" in capsys.readouterr().err
+
+
+def test_every_class_is_pictured(candidates: GraspCandidates):
+    names = ("BodyGrasp",) * 6 + ("RimGrasp",) * 5 + ("LidGrasp",)
+    several = replace(candidates, grasp_class=names, valid=torch.arange(COUNT) != 0)
+    assert chosen(several) == [1, 2, 6, 11]
+    assert chosen(replace(several, valid=torch.zeros(COUNT, dtype=torch.bool))) == [0, 1, 6, 11]

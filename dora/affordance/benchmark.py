@@ -1,6 +1,7 @@
 """How fast the grasp search is: candidates per second, where the time goes, how it grows, and against what.
 
-The reference is the same search with forward kinematics of pytorch_kinematics and with closest points of
+All times are processor times of one thread, after Numba has compiled (it keeps the result on disk). The reference is
+the same optimisation, energy and gradient, with forward kinematics of pytorch_kinematics and with closest points of
 trimesh instead of the distance field, in the same process.
 """
 
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytorch_kinematics
@@ -17,51 +18,80 @@ import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dora.affordance.compiled import CompiledDescent, CompiledEnergy
+from dora.affordance.descent import Rows, Schedule
 from dora.affordance.energies import GraspEnergy
 from dora.affordance.hand import HandModel
+from dora.affordance.holding import hold
 from dora.affordance.initial import InitialPoses
+from dora.affordance.native.parts import PARTS, repeat
 from dora.affordance.objects import load_object
-from dora.affordance.optimise import optimise
-from dora.affordance.search import Rows, Search, Settings
+from dora.affordance.optimise import optimise, seated, table_of
+from dora.affordance.prepared import forget
+from dora.affordance.protocol import pregrasp, squeeze
+from dora.affordance.search import Search, Settings
 from dora.affordance.signed_distance import CHANNELS, SignedDistanceField
 from dora.affordance.structure import AffordanceObject
 from dora.robot import RobotDescription
 
-BATCHES = (32, 128, 256)
+NUM = 256
+"""Candidates asked for."""
+BATCHES = (32, 128, 512)
 """Candidates searched at once."""
+ROWS = (1, 8, 32, 128, 512)
+"""Candidates evaluated at once."""
 SUBDIVISIONS = (0, 1, 2)
 """How often the object's faces are divided by four."""
+PART_REPEATS = 200
+"""How often a part is done for each candidate, in one measurement."""
+PART_ROWS = 32
 REFERENCE_ROWS = 8
-"""Candidates of the reference, which takes seconds per iteration for more."""
-REFERENCE_ITERATIONS = 3
-REPEATS = 20
-"""Measurements of a part; the fastest counts."""
+"""Candidates of the reference, which takes seconds per evaluation for more."""
+REFERENCE_REPEATS = 3
+REPEATS = 10
+"""Measurements of a short piece of work; the fastest counts, since other programs only slow it down."""
 
 
 @dataclass(frozen=True)
 class GraspBenchmark:
-    """Result of `measure`; times are processor times of one thread.
+    """Result of `measure`.
 
     Attributes:
         object: name.
-        iterations: gradient steps per candidate.
-        candidates_per_second: of the whole of `optimise`, tables included, at the standard batch.
-        by_batch: candidates/s of the search alone, by batch size.
-        shares: share of an iteration's time by part: forward kinematics, groups of energy terms, the rest.
-        by_faces: seconds to fill the distance field and milliseconds of one evaluation of energy and gradient at the
-            standard batch, by number of faces.
-        reference_candidates_per_second: of the reference search.
-        ratio: candidates/s of the search at the standard batch over those of the reference.
+        region: what is to be held.
+        num: candidates asked for.
+        candidates_per_second: of the whole of `optimise` for an object that it has met before in this process.
+        first_candidates_per_second: of its first call, which fills the distance field and samples surfaces, too.
+        by_batch: candidates/s of `optimise` by candidates searched at once.
+        stages: milliseconds per candidate asked for: search, closing the hands, polish, and judging by the model (here
+            of all rows; `optimise` judges only those without fault).
+        evaluation_microseconds: of energy and gradient of one candidate, by candidates evaluated at once.
+        step_microseconds: of a step of descent of one candidate.
+        shares: share of the time of a step, by part. Parts are timed one by one in compiled loops and overlap a
+            little with their surroundings; `rest` is what their sum lacks.
+        by_faces: seconds to fill the distance field, and microseconds of an evaluation, by the mesh's number of faces.
+        reference_microseconds: of an evaluation of one candidate in the reference.
+        ratio: `reference_microseconds` over those of ours at the standard batch. Both searches take the same
+            evaluations, so this is the ratio of candidates per second of the optimisation.
+        reference_candidates_per_second: of the search alone with the reference, by its number of evaluations.
+        search_candidates_per_second: of the search alone.
     """
 
     object: str
-    iterations: int
+    region: str
+    num: int
     candidates_per_second: float
+    first_candidates_per_second: float
     by_batch: dict[int, float]
+    stages: dict[str, float]
+    evaluation_microseconds: dict[int, float]
+    step_microseconds: float
     shares: dict[str, float]
     by_faces: dict[int, dict[str, float]]
-    reference_candidates_per_second: float
+    reference_microseconds: float
     ratio: float
+    reference_candidates_per_second: float
+    search_candidates_per_second: float
 
 
 class PlainHand(HandModel):
@@ -106,7 +136,7 @@ def measure(name: str, robot: RobotDescription, settings: Settings | None = None
     """Measure the search of one object, on one thread.
 
     Args:
-        name: one of `available_objects`.
+        name: one of `available_objects`; what its task wants held is the region.
         robot: whose hand it is.
         settings: of the search.
 
@@ -122,85 +152,120 @@ def measure(name: str, robot: RobotDescription, settings: Settings | None = None
 
 
 def _measure(obj: AffordanceObject, robot: RobotDescription, settings: Settings) -> GraspBenchmark:
-    hand = HandModel(robot)
-    whole = settings.batch / _seconds(lambda: optimise(obj, robot, settings.batch, 0, settings=settings))
-    search = _search(obj, hand, SignedDistanceField(obj.solid), settings)
-    by_batch = {batch: _rate(search, batch) for batch in BATCHES}
-    by_faces = {}
-    solid = obj.solid
-    for _ in SUBDIVISIONS:
-        start = time.process_time()
-        field = SignedDistanceField(solid)
-        filled = time.process_time() - start
-        evaluation = _iteration(_search(obj, hand, field, settings), settings.batch, REPEATS)
-        by_faces[len(solid.faces)] = {"fill_seconds": filled, "milliseconds": 1e3 * evaluation}
-        solid = solid.subdivide()
-    plain = _search(obj, PlainHand(robot), PlainField(obj.solid), settings)
-    ours = _iteration(search, settings.batch, REPEATS)
-    reference = _iteration(plain, REFERENCE_ROWS, REFERENCE_ITERATIONS)
-    ratio = (reference / REFERENCE_ROWS) / (ours / settings.batch)
+    def whole(batch: int) -> float:
+        return _seconds(lambda: optimise(obj, robot, NUM, 0, obj.target, replace(settings, batch=batch)))
+
+    optimise(obj, robot, 1, 0, obj.target, settings)
+    forget()
+    first, later = whole(settings.batch), whole(settings.batch)
+    search = _search(obj, HandModel(robot), SignedDistanceField(obj.solid, obj.region(obj.target)), settings)
+    evaluation = {rows: 1e6 * _evaluation(search, rows) for rows in ROWS}
+    alone = _seconds(lambda: search.run(settings.batch, _generator(), lambda rows: None)) / settings.batch
+    step, shares = _shares(search)
+    reference = _reference(obj, robot, settings)
+    ratio = reference / _evaluation(search, settings.batch)
     return GraspBenchmark(
         object=obj.name,
-        iterations=settings.iterations,
-        candidates_per_second=whole,
-        by_batch=by_batch,
-        shares=_shares(search, settings.batch),
-        by_faces=by_faces,
-        reference_candidates_per_second=by_batch[settings.batch] / ratio
-        if settings.batch in by_batch
-        else whole / ratio,
+        region=obj.target,
+        num=NUM,
+        candidates_per_second=NUM / later,
+        first_candidates_per_second=NUM / first,
+        by_batch={batch: NUM / whole(batch) for batch in BATCHES},
+        stages=_stages(obj, search),
+        evaluation_microseconds=evaluation,
+        step_microseconds=1e6 * step,
+        shares=shares,
+        by_faces=_by_faces(obj, search, settings),
+        reference_microseconds=1e6 * reference,
         ratio=ratio,
+        reference_candidates_per_second=1 / (alone * ratio),
+        search_candidates_per_second=1 / alone,
     )
 
 
 def _search(obj: AffordanceObject, hand: HandModel, field: SignedDistanceField, settings: Settings) -> Search:
-    energy = GraspEnergy(hand, field, settings.weights)
-    return Search(energy, InitialPoses(obj, hand, None, settings.spread), settings)
+    """What `optimise` searches with, on the object's table."""
+    energy = CompiledEnergy(hand, field, settings.weights, table_of(obj))
+    return Search(energy, InitialPoses(obj, hand, obj.target, settings.spread), settings)
 
 
-def _rate(search: Search, count: int) -> float:
-    """Candidates per second of the search alone."""
-    return count / _seconds(lambda: search.run(count, torch.Generator().manual_seed(0), lambda rows: None))
+def _reference(obj: AffordanceObject, robot: RobotDescription, settings: Settings) -> float:
+    """Seconds of an evaluation of one candidate with pytorch_kinematics and trimesh."""
+    hand = PlainHand(robot)
+    energy = GraspEnergy(hand, PlainField(obj.solid), settings.weights, table_of(obj))
+    search = Search(energy, InitialPoses(obj, hand, obj.target, settings.spread), replace(settings, starts=1))
+    return _evaluation(search, REFERENCE_ROWS, REFERENCE_REPEATS)
+
+
+def _by_faces(obj: AffordanceObject, search: Search, settings: Settings) -> dict[int, dict[str, float]]:
+    """Growth with the mesh: see `GraspBenchmark.by_faces`."""
+    found, solid = {}, obj.solid
+    for _ in SUBDIVISIONS:
+        start = time.process_time()
+        field = SignedDistanceField(solid)
+        filled = time.process_time() - start
+        energy = CompiledEnergy(search.energy.hand, field, settings.weights, table_of(obj))
+        rate = _evaluation(Search(energy, search.initial, settings), settings.batch)
+        found[len(solid.faces)] = {"fill_seconds": filled, "evaluation_microseconds": 1e6 * rate}
+        solid = solid.subdivide()
+    return found
+
+
+def _stages(obj: AffordanceObject, search: Search) -> dict[str, float]:
+    """Milliseconds that each stage of `optimise` takes per candidate asked for, by one batch of the search."""
+    settings, energy, robot = search.settings, search.energy, search.energy.hand.robot
+    assert isinstance(energy, CompiledEnergy)
+    rows: list[Rows] = []
+
+    def judge(rows: Rows) -> None:
+        full = robot.expand_hand(rows.joints)
+        hold(energy, rows.wrist, pregrasp(robot, full), squeeze(robot, full), obj.mass, wanted=wanted)
+
+    wanted = round(settings.batch / settings.oversampling)
+    seconds = {
+        "search": _seconds(lambda: rows.append(search.run(settings.batch, _generator(), lambda count: None))),
+        "seating": _seconds(lambda: rows.append(seated(energy, rows[0], obj.mass, settings.seat))),
+        "polish": _seconds(lambda: rows.append(search.polish(rows[1], settings.polish))),
+        "judging": _seconds(lambda: judge(rows[2])),
+    }
+    return {name: 1e3 * value * settings.oversampling / settings.batch for name, value in seconds.items()}
+
+
+def _shares(search: Search) -> tuple[float, dict[str, float]]:
+    """Seconds of a step of descent of one candidate, and the share of each part, at candidates that touch."""
+    rows = search.run(PART_ROWS, _generator(), lambda count: None)
+    energy, descent = search.energy, search.descent
+    assert isinstance(energy, CompiledEnergy)
+    assert isinstance(descent, CompiledDescent)
+    adam = descent.adam([0.0])
+    arrays = energy.arrays, energy.field_arrays, energy.factors(1.0), energy.plane(), adam
+    places = rows.wrist.numpy(), rows.joints.numpy(), rows.contacts.numpy()
+    done = PART_ROWS * PART_REPEATS
+    still = Schedule(0, [1.0] * PART_REPEATS, [0.0] * PART_REPEATS)
+    step = min(_seconds(lambda: search.descent(rows, still)) for _ in range(REPEATS)) / done
+    shares = {}
+    for index, name in enumerate(PARTS):
+        repeat(index, 1, *arrays, *places)
+        seconds = min(_seconds(lambda i=index: repeat(i, PART_REPEATS, *arrays, *places)) for _ in range(REPEATS))
+        shares[name] = seconds / done / step
+    for twice in ("forward_kinematics", "gradient"):
+        shares[twice] *= 2
+    return step, shares | {"rest": max(0.0, 1 - sum(shares.values()))}
+
+
+def _evaluation(search: Search, rows: int, repeats: int = REPEATS) -> float:
+    """Seconds of energy and gradient of one candidate, evaluated with others, all in front of the object."""
+    start = search.start(rows, _generator())
+    places = start.wrist, start.joints, start.contacts
+    return min(_seconds(lambda: search.energy(*places)) for _ in range(repeats)) / rows
+
+
+def _generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
 
 
 def _seconds(work: Callable[[], object]) -> float:
+    """Processor time."""
     start = time.process_time()
     work()
     return time.process_time() - start
-
-
-def _settled_rows(search: Search, count: int) -> Rows:
-    """Candidates that touch, as in most of a search."""
-    return search.run(count, torch.Generator().manual_seed(0), lambda rows: None)
-
-
-def _iteration(search: Search, count: int, repeats: int) -> float:
-    """Seconds of one evaluation of energy and gradient."""
-    rows = search.start(count, torch.Generator().manual_seed(0))
-    return min(_seconds(lambda: search.energy(rows.wrist, rows.joints, rows.contacts)) for _ in range(repeats))
-
-
-def _shares(search: Search, count: int) -> dict[str, float]:
-    """Shares of one iteration's time, at converged candidates; `rest` is assembling the gradient and Adam."""
-    energy, hand = search.energy, search.energy.hand
-    rows = _settled_rows(search, count)
-    count = len(rows)
-    poses = hand.forward(rows.wrist, rows.joints)
-    wrench = poses.new_zeros(count, poses.shape[1], 6)
-    found = energy(rows.wrist, rows.joints, rows.contacts)
-    parts: dict[str, Callable[[], object]] = {
-        "forward_kinematics": lambda: hand.forward(rows.wrist, rows.joints),
-        "closure_distance_region": lambda: energy.contact_terms(poses, rows.contacts),
-        "penetration_table": lambda: energy.sphere_terms(poses),
-        "closing": lambda: energy.closing(poses, rows.contacts),
-        "self_penetration": lambda: energy.self_penetration(poses),
-        "limits": lambda: energy.limits(rows.joints),
-        "pull_back": lambda: hand.pull_back(poses, wrench),
-        "adam": lambda: search.descend(rows, found, 0, 0.0),
-    }
-    seconds = {name: min(_seconds(part) for _ in range(REPEATS)) for name, part in parts.items()}
-    whole = seconds["adam"] + min(
-        _seconds(lambda: energy(rows.wrist, rows.joints, rows.contacts)) for _ in range(REPEATS)
-    )
-    shares = {name: value / whole for name, value in seconds.items()}
-    return shares | {"rest": max(0.0, 1 - sum(shares.values()))}

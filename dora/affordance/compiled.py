@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from functools import cache
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dora.affordance.descent import MEAN_DECAY, SMALLEST, SQUARE_DECAY, Descent, Rows, Schedule
 from dora.affordance.energies import RAMPED, TERMS, Evaluation, GraspEnergy
-from dora.affordance.native.energy import evaluate
+from dora.affordance.native.energy import Adam, descend, evaluate
 from dora.affordance.native.field import FieldArrays
 from dora.affordance.native.hand import HandArrays
 from dora.affordance.signed_distance import CULL, SignedDistanceField
@@ -28,10 +29,9 @@ class CompiledEnergy(GraspEnergy):
         ramp: float = 1.0,
     ) -> Evaluation:
         """As `GraspEnergy`."""
-        weights = np.array([getattr(self.weights, name) * (ramp if name in RAMPED else 1.0) for name in TERMS])
-        plane = self.plane()
+        weights = self.factors(ramp)
         terms, gradient = evaluate(
-            self.arrays(), self.field_arrays(), weights, plane, wrist.numpy(), joints.numpy(), contacts.numpy()
+            self.arrays, self.field_arrays, weights, self.plane(), wrist.numpy(), joints.numpy(), contacts.numpy()
         )
         value = torch.from_numpy(terms).to(joints)
         gradients = torch.from_numpy(gradient).to(joints)
@@ -45,17 +45,21 @@ class CompiledEnergy(GraspEnergy):
             total, {name: value[:, TERMS.index(name)] for name in names}, gradients[:, :6], gradients[:, 6:]
         )
 
+    def factors(self, ramp: float) -> np.ndarray:
+        """Weights (terms,) times the factor on `RAMPED`."""
+        return np.array([getattr(self.weights, name) * (ramp if name in RAMPED else 1.0) for name in TERMS])
+
     def plane(self) -> np.ndarray:
         """Normal and offset (m) of the table, for compiled functions; infinitely far if there is none."""
         normal, offset = ((0.0, 0.0, 0.0), math.inf) if self.table is None else (self.table.normal, self.table.offset)
         return np.array([*normal, offset])
 
-    @cache  # noqa: B019
+    @cached_property
     def field_arrays(self) -> FieldArrays:
         """The object for compiled functions."""
         return _field_arrays(self.field)
 
-    @cache  # noqa: B019
+    @cached_property
     def arrays(self) -> HandArrays:
         """The hand for compiled functions."""
         hand, numbers = self.hand, {}
@@ -90,12 +94,33 @@ class CompiledEnergy(GraspEnergy):
         return HandArrays(depth=hand.depth, **numbers)
 
 
+class CompiledDescent(Descent):
+    """`Descent` compiled: every row takes all its steps at once."""
+
+    energy: CompiledEnergy
+
+    def __call__(self, rows: Rows, schedule: Schedule) -> None:
+        """As `Descent`."""
+        energy = self.energy
+        factors = np.array([energy.factors(ramp) for ramp in schedule.ramp])
+        adam = self.adam(schedule.size, schedule.before)
+        arrays = (part.numpy() for part in (rows.wrist, rows.joints, rows.contacts, rows.mean, rows.square))
+        terms = descend(energy.arrays, energy.field_arrays, factors, energy.plane(), adam, *arrays)
+        ramped = [TERMS.index(name) for name in RAMPED]
+        rows.total = torch.from_numpy(terms @ factors[-1]).to(rows.joints)
+        rows.overlap = torch.from_numpy(terms[:, ramped].sum(1)).to(rows.joints)
+
+    def adam(self, size: list[float], before: int = 0) -> Adam:
+        """Step sizes and decays for compiled functions."""
+        return Adam(self.largest.double().numpy(), np.array(size), before, MEAN_DECAY, SQUARE_DECAY, SMALLEST)
+
+
 def _field_arrays(field: SignedDistanceField) -> FieldArrays:
     table = np.ascontiguousarray(field.table.numpy())
     x, y, z = field.shape
     return FieldArrays(
         table=table,
-        distance=np.ascontiguousarray(table[:, :1]),
+        distance=np.ascontiguousarray(table[:, 0]),
         shape=(x, y, z),
         lower=tuple(field.lower.tolist()),
         inverse=1 / field.spacing,

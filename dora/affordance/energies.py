@@ -18,6 +18,7 @@ to wrist and joints. No automatic differentiation is involved, and only points t
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -151,6 +152,12 @@ class GraspEnergy:
         total = torch.stack([factor[name] * value for name, value in terms.items()]).sum(0)
         joint_gradient = joint_gradient + joint_closed + factor["limits"] * slope
         return Evaluation(total, terms, wrist_gradient + wrist_closed, joint_gradient)
+
+    def weighted(self, weights: Weights) -> GraspEnergy:
+        """The same energy with other weights."""
+        other = copy(self)
+        other.weights = weights
+        return other
 
     def contact_points(
         self, poses: Float[Tensor, "c b 4 4"], contacts: Int[Tensor, "c k"]

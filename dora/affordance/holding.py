@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dora.affordance.compiled import CompiledEnergy
 from dora.affordance.hand import HandModel
-from dora.affordance.native.closing import ARM, STIFFNESS, Drives, Model, Steps, close_and_load
+from dora.affordance.native.closing import ARM, STIFFNESS, Drives, Model, Ranking, Steps, close_and_load
 from dora.affordance.protocol import DIRECTIONS, STANDARD, Protocol
 
 SAFETY = 2.0
@@ -66,6 +66,7 @@ def hold(
     protocol: Protocol = STANDARD,
     steps: Steps = STEPS,
     on_table: bool = False,
+    wanted: int | None = None,
 ) -> Holding:
     """Close and load every candidate.
 
@@ -78,9 +79,11 @@ def hold(
         protocol: has friction, gravity.
         steps: of the model.
         on_table: whether the hand stays above the energy's table.
+        wanted: of the best by `Holding.quality` are looked for; the displacement of others may be told too small, yet
+            never so small that they would be among the best. None: all.
     """
     hand, robot = energy.hand, energy.hand.robot.hand
-    arrays = energy.arrays()
+    arrays = energy.arrays
     joints, order = len(arrays.axes), hand.joint_index
     free = arrays._replace(
         leader=np.arange(joints), gain=np.ones(joints), offset=np.zeros(joints), close=np.zeros(joints)
@@ -94,11 +97,12 @@ def hold(
     )
     center = torch.as_tensor(hand.grip.center + ARM * hand.grip.normal).double().numpy()
     plane = energy.plane() if on_table else np.array([0.0, 0.0, 0.0, np.inf])
-    model = Model(free, energy.field_arrays(), drives, center, float(protocol.friction), plane)
+    model = Model(free, energy.field_arrays, drives, center, float(protocol.friction), plane)
     load = SAFETY * mass * protocol.gravity
     end, final = wrist.double().numpy().copy(), opened[:, order].double().numpy()
     command = squeezed[:, order].double().numpy()
-    result = close_and_load(model, steps, load, np.array(DIRECTIONS), end, final, command)
+    ranking = Ranking(MUCH, SHIFT_SHARE, max(1, min(len(end), wanted or len(end))))
+    result = close_and_load(model, steps, ranking, load, np.array(DIRECTIONS), end, final, command)
     found = torch.from_numpy(result).to(wrist)
     joints = opened.clone()
     joints[:, order] = torch.from_numpy(final).to(opened)

@@ -14,15 +14,13 @@ from torch import Tensor
 from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.compiled import CompiledEnergy
 from dora.affordance.contact_map import hand_contacts
+from dora.affordance.descent import Rows
 from dora.affordance.energies import GraspEnergy, Table
-from dora.affordance.hand import HandModel
 from dora.affordance.holding import Steps, hold
-from dora.affordance.initial import InitialPoses
-from dora.affordance.map import AffordanceMap
 from dora.affordance.measures import Penetration, self_penetration
+from dora.affordance.prepared import field_of, hand_of, initial_of, map_of
 from dora.affordance.protocol import STANDARD, pregrasp, squeeze
-from dora.affordance.search import Rows, Search, Settings
-from dora.affordance.signed_distance import SignedDistanceField
+from dora.affordance.search import Search, Settings
 from dora.affordance.structure import AffordanceObject
 from dora.affordance.voting import NO_CONTACT, vote
 from dora.errors import InputError
@@ -39,6 +37,8 @@ OPENINGS = (0.25, 0.5, 0.75, 1.0)
 """Shares of the protocol's opening that are tried."""
 OPENING_DEPTH = 1e-3
 """Overlap (m) with the object up to which a finger counts as clear of it."""
+SHALLOW = 9e-4
+"""Penetration (m) above which a candidate comes after those with less."""
 SEATING = Steps(closing=60, settling=20, weight=0)
 """Steps of the hand that closes around the object."""
 NO_CLASS = "NoContact"
@@ -77,12 +77,12 @@ def optimise(
     settings = settings or Settings()
     if num < 1:
         raise InputError(f"the search makes at least 1 candidate, not {num}.")
-    hand = HandModel(robot, device=device)
-    field = SignedDistanceField(obj.solid, None if region is None else obj.region(region), device=device)
+    place = str(torch.device(device))
+    hand, field = hand_of(robot, place), field_of(obj, region, place)
     on_table = obj.name not in OFF_TABLE if settings.table is None else settings.table
     kind = CompiledEnergy if hand.device.type == "cpu" else GraspEnergy
     energy = kind(hand, field, settings.weights, table_of(obj) if on_table else None)
-    search = Search(energy, InitialPoses(obj, hand, region, settings.spread), settings)
+    search = Search(energy, initial_of(obj, robot, region, settings.spread, place), settings)
     wanted = math.ceil(num * settings.oversampling)
     sizes = [min(settings.batch, wanted - start) for start in range(0, wanted, settings.batch)]
     done, total = 0, wanted * settings.iterations
@@ -93,16 +93,13 @@ def optimise(
         if progress is not None:
             progress(done, total)
 
-    found = [
-        _seated(
-            energy,
-            search,
-            search.run(size, torch.Generator().manual_seed(batch_seed(seed, index)), report),
-            obj.mass,
-            settings,
-        )
-        for index, size in enumerate(sizes)
-    ]
+    def batch(size: int, index: int) -> Rows:
+        rows = search.run(size, torch.Generator().manual_seed(batch_seed(seed, index)), report)
+        if settings.seat and isinstance(energy, CompiledEnergy):
+            rows = search.polish(seated(energy, rows, obj.mass, settings.seat), settings.polish)
+        return rows
+
+    found = [batch(size, index) for index, size in enumerate(sizes)]
     return _candidates(obj, energy, Rows.join(found), num, settings)
 
 
@@ -125,13 +122,15 @@ def _candidates(
     found = energy(rows.wrist, rows.joints, rows.contacts, settings.ramp)
     poses = hand.forward(rows.wrist, rows.joints)
     depth, self_depth = Penetration(hand, energy.field)(poses), self_penetration(energy, poses)
-    faults = 2 * (depth > STANDARD.penetration).long() + (self_depth > STANDARD.strict_self_penetration).long()
-    quality, predicted = _quality(obj, energy, rows, found.total, faults.argsort(stable=True)[: _judged(faults, num)])
+    faults = 4 * (depth > STANDARD.penetration).long() + 2 * (self_depth > STANDARD.strict_self_penetration).long()
+    faults += (depth > SHALLOW).long()
+    judged = faults.argsort(stable=True)[: _judged(faults, num)]
+    quality, predicted = _quality(obj, energy, rows, found.total, judged, num)
     order = quality.argsort(descending=True)
     best = order[faults[order].argsort(stable=True)][:num]
     poses, joints, wrist = poses[best], rows.joints[best], rows.wrist[best]
     points, finger = hand_contacts(hand, energy.field, poses)
-    held = vote(AffordanceMap.from_object(obj).to(points.device), points, finger)
+    held = vote(map_of(obj, str(points.device)), points, finger)
     full = robot.expand_hand(joints)
     normal = full.new_tensor(hand.grip.normal)
     return GraspCandidates(
@@ -162,14 +161,15 @@ def _judged(faults: Tensor, num: int) -> int:
 
 
 def _quality(
-    obj: AffordanceObject, energy: GraspEnergy, rows: Rows, total: Tensor, judged: Tensor
+    obj: AffordanceObject, energy: GraspEnergy, rows: Rows, total: Tensor, judged: Tensor, num: int
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """What candidates are ranked by (c,), more is better, and the predictions it is made of, for the rows judged."""
+    """What candidates are ranked by (c,), more is better, and the predictions it is made of, for the rows judged; of
+    which the `num` best are wanted."""
     if not isinstance(energy, CompiledEnergy):
         return -total, {}
     robot = energy.hand.robot
     full = robot.expand_hand(rows.joints[judged])
-    held = hold(energy, rows.wrist[judged], pregrasp(robot, full), squeeze(robot, full), obj.mass)
+    held = hold(energy, rows.wrist[judged], pregrasp(robot, full), squeeze(robot, full), obj.mass, wanted=num)
 
     def spread(values: Tensor, missing: float) -> Tensor:
         return torch.full_like(total, missing).index_copy_(0, judged, values)
@@ -182,16 +182,20 @@ def _quality(
     return spread(held.quality, -math.inf), predictions
 
 
-def _seated(energy: GraspEnergy, search: Search, rows: Rows, mass: float, settings: Settings) -> Rows:
-    """Rows after their hands have closed around the object, overlaps removed; what a squeeze then adds is force."""
-    if not settings.seat or not isinstance(energy, CompiledEnergy):
-        return rows
+def seated(energy: CompiledEnergy, rows: Rows, mass: float, squeezed: float) -> Rows:
+    """Rows after their hands have closed around the object; what a squeeze then adds is force.
+
+    Args:
+        energy: knows hand, object and table.
+        rows: with the fingers about where they should touch.
+        mass: of the object (kg).
+        squeezed: how far the command goes beyond the posture (rad).
+    """
     robot = energy.hand.robot
     full = robot.expand_hand(rows.joints)
-    closed = squeeze(robot, full, replace(STANDARD, squeeze=settings.seat))
+    closed = squeeze(robot, full, replace(STANDARD, squeeze=squeezed))
     held = hold(energy, rows.wrist, pregrasp(robot, full), closed, mass, steps=SEATING, on_table=True)
-    rows.wrist, rows.joints = held.wrist.contiguous(), robot.reduce_hand(held.joints)
-    return search.polish(rows, settings.polish)
+    return replace(rows, wrist=held.wrist.contiguous(), joints=robot.reduce_hand(held.joints))
 
 
 def opened(energy: GraspEnergy, wrist: Float[Tensor, "c 4 4"], joints: Float[Tensor, "c j"]) -> Float[Tensor, "c j"]:

@@ -1,4 +1,4 @@
-"""PNG pictures of affordance maps and grasps, on any machine."""
+"""PNG pictures of grasps and contact semantic maps, on any machine."""
 
 from __future__ import annotations
 
@@ -34,21 +34,14 @@ TILE = 420
 """Width and height of one view [pixels]."""
 DPI = 100
 """Pixels per inch of figures."""
-VIEWS = ((0.6, 0.35), (2.6, 0.35), (4.6, 0.6))
-"""Azimuth and elevation of the views of a map [rad]."""
+VIEW = (0.6, 0.35)
+"""Azimuth, where there is nothing to look at, and elevation of the views of contact maps [rad]."""
 
 
 def coloured(obj: AffordanceObject) -> trimesh.Trimesh:
     """The object's mesh, every face in the colour of its region."""
     mesh = obj.mesh
     return trimesh.Trimesh(mesh.vertices, mesh.faces, face_colors=colours(obj.face_labels, PALETTE), process=False)
-
-
-def picture_map(obj: AffordanceObject, path: Path | str) -> None:
-    """Write a PNG of the object's regions from three sides, with a legend."""
-    mesh = coloured(obj)
-    views = [render([mesh], Camera.around([mesh], *view), TILE, TILE) for view in VIEWS]
-    _write(views, [""] * len(views), dict(zip(obj.labels, PALETTE, strict=False)), len(views), obj.name, Path(path))
 
 
 def picture_grasps(
@@ -66,15 +59,33 @@ def picture_grasps(
 
 
 def picture_contacts(
-    obj: AffordanceObject, faces: Sequence[Int[np.ndarray, " f"]], titles: Sequence[str], path: Path | str
+    mesh: trimesh.Trimesh,
+    faces: Sequence[Int[np.ndarray, " f"]],
+    titles: Sequence[str],
+    name: str,
+    path: Path | str,
 ) -> None:
-    """Write a PNG of contact semantic maps: per map the class of every face of the object's mesh, 0..6."""
+    """Write a PNG of contact semantic maps, each seen from where most of its contacts are.
+
+    Args:
+        mesh: the object's surface, fine enough to carry colours.
+        faces: per map the class of every face, 0..6.
+        titles: of the maps.
+        name: of the object.
+        path: of the file.
+    """
     table = tuple(PARTS.values())
     views = []
     for classes in faces:
-        mesh = trimesh.Trimesh(obj.mesh.vertices, obj.mesh.faces, face_colors=colours(classes, table), process=False)
-        views.append(render([mesh], Camera.around([mesh], *VIEWS[0]), TILE, TILE))
-    _write(views, titles, PARTS, len(views), obj.name, Path(path))
+        painted = trimesh.Trimesh(mesh.vertices, mesh.faces, face_colors=colours(classes, table), process=False)
+        views.append(render([painted], Camera.around([painted], *_towards(mesh, classes > 0)), TILE, TILE))
+    _write(views, titles, PARTS, len(views), name, Path(path))
+
+
+def _towards(mesh: trimesh.Trimesh, faces: np.ndarray) -> tuple[float, float]:
+    """Azimuth and elevation [rad] of a view from the side to which most of the area of some faces looks."""
+    x, y, _ = (mesh.area_faces * faces) @ mesh.face_normals
+    return (float(np.arctan2(y, x)) if np.hypot(x, y) > 0 else VIEW[0]), VIEW[1]
 
 
 def caption(candidates: GraspCandidates, row: int) -> str:

@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from dora.affordance.energies import RAMPED, Evaluation, GraspEnergy, Weights
+from dora.affordance.compiled import CompiledDescent, CompiledEnergy
+from dora.affordance.descent import Descent, Rows, Schedule
+from dora.affordance.energies import GraspEnergy, Weights
 from dora.affordance.initial import InitialPoses, Spread
 from dora.errors import InputError
-from dora.robot.rotations import matrix_from_quaternion
 
 
 @dataclass(frozen=True)
@@ -50,20 +52,21 @@ class Settings:
         spread: of the initial poses.
     """
 
-    iterations: int = 70
+    iterations: int = 40
     contacts: int = 9
     weights: Weights = field(default_factory=Weights)
     ramp: float = 12.0
     ramp_start: float = 0.4
-    resample: int = 20
+    resample: int = 8
     resample_until: float = 0.6
-    starts: int = 6
+    starts: int = 8
     field_size: float = 2.0
-    halving: float = 0.25
+    halving: float = 0.5
     settle: float = 0.6
     oversampling: float = 2.5
     seat: float = 0.7
-    polish: int = 60
+    polish: int = 80
+    polish_weights: Weights = field(default_factory=lambda: Weights(closure=0.0, closing=300.0))
     translation: float = 2e-3
     rotation: float = 0.02
     joint: float = 0.02
@@ -77,48 +80,12 @@ class Settings:
                 raise InputError(f"the search needs {name} of at least 1, not {getattr(self, name)}.")
 
 
-@dataclass
-class Rows:
-    """Candidates under search.
-
-    `wrist` (c, 4, 4) in the object frame, `joints` (c, a) in rad, `contacts` (c, k) indices of contact points,
-    `mean` and `square` (c, 6 + a) Adam's moments, `total` (c,) energy when last looked at.
-    """
-
-    wrist: Tensor
-    joints: Tensor
-    contacts: Tensor
-    mean: Tensor
-    square: Tensor
-    total: Tensor
-
-    @classmethod
-    def begin(cls, wrist: Tensor, joints: Tensor, contacts: Tensor, total: Tensor) -> Rows:
-        """Rows that have not moved yet."""
-        mean = joints.new_zeros(len(joints), 6 + joints.shape[1])
-        return cls(wrist, joints, contacts, mean, torch.zeros_like(mean), total)
-
-    def __len__(self) -> int:
-        return len(self.joints)
-
-    def select(self, index: Tensor) -> Rows:
-        """The rows of an index or a mask."""
-        return Rows(*(getattr(self, part.name)[index] for part in fields(self)))
-
-    @staticmethod
-    def join(parts: list[Rows]) -> Rows:
-        """Rows of several parts, in their order."""
-        return Rows(*(torch.cat([getattr(rows, part.name) for rows in parts]) for part in fields(Rows)))
-
-
 CHECK = 5
 """Iterations between checks for rows that have settled."""
 SETTLED = 2e-3
 """Relative change of the energy between two checks below which a row has settled."""
 TOLERANCE = 1e-4
 """Sum of overlaps (m) that a settled row may have, skin included."""
-MEAN_DECAY, SQUARE_DECAY = 0.9, 0.98
-"""Adam's decay rates."""
 POLISH_STEP = 0.5
 """Largest steps of polishing, in those of the search."""
 LAST_STEP = 0.01
@@ -132,24 +99,32 @@ class Search:
         self.energy, self.initial, self.settings = energy, initial, settings
         hand = energy.hand
         steps = [settings.translation] * 3 + [settings.rotation] * 3 + [settings.joint] * len(hand.lower)
-        self._steps = hand.lower.new_tensor(steps)
+        kind = CompiledDescent if isinstance(energy, CompiledEnergy) else Descent
+        self.descent = kind(energy, hand.lower.new_tensor(steps))
+        self.polishing = kind(energy.weighted(settings.polish_weights), hand.lower.new_tensor(steps))
         parts = hand.contact_part.unique().tolist()
         self._points = [(hand.contact_part == part).nonzero().squeeze(1) for part in parts]
 
     def run(self, count: int, generator: torch.Generator, progress: Callable[[int], None]) -> Rows:
-        """Search and return `count` candidates; `progress` gets the number of rows after every iteration."""
+        """Search and return `count` candidates; `progress` gets the number of rows times the steps they took."""
         settings, hand = self.settings, self.energy.hand
         rows = self.start(math.ceil(count * settings.field_size), generator)
+        last = settings.iterations
+        halving = max(1, int(settings.halving * last))
+        resampling = range(settings.resample, math.ceil(settings.resample_until * last), settings.resample)
+        checks = range(CHECK * (1 + int(settings.settle * last) // CHECK), last, CHECK)
         finished = []
-        halving = int(settings.halving * settings.iterations)
-        for step in range(settings.iterations):
-            found = self._step(rows, step, generator)
-            progress(len(rows))
-            if step == halving:
-                rows = rows.select(found.total.argsort()[:count])
-            elif step > settings.settle * settings.iterations and step % CHECK == 0:
-                settled = self._settled(rows, found)
-                rows.total = found.total
+        for start, stop in pairwise(sorted({0, last, halving, *resampling, *checks})):
+            if start in resampling:
+                self._resample(rows, self._ramp(start), generator)
+            before = rows.total
+            steps = range(start, stop)
+            self.descent(rows, Schedule(start, [self._ramp(i) for i in steps], [fading(i / last) for i in steps]))
+            progress(len(rows) * len(steps))
+            if stop == halving:
+                rows = rows.select(rows.total.argsort()[:count])
+            elif stop in checks:
+                settled = ((before - rows.total).abs() < SETTLED * rows.total) & (rows.overlap < TOLERANCE)
                 finished.append(rows.select(settled))
                 rows = rows.select(~settled)
                 if not len(rows):
@@ -158,10 +133,12 @@ class Search:
         rows.joints = torch.clamp(rows.joints, hand.lower, hand.upper)
         return rows
 
-    def _settled(self, rows: Rows, found: Evaluation) -> Tensor:
-        """Rows (c,) whose energy has stopped falling and whose terms that must vanish have vanished."""
-        still = (rows.total - found.total).abs() < SETTLED * found.total
-        return still & (sum(found.terms.get(name, found.total * 0) for name in RAMPED) < TOLERANCE)
+    def _ramp(self, step: int) -> float:
+        """Factor on the weights of `RAMPED`."""
+        settings = self.settings
+        return 1 + (settings.ramp - 1) * max(0.0, step / settings.iterations - settings.ramp_start) / (
+            1 - settings.ramp_start
+        )
 
     def start(self, count: int, generator: torch.Generator) -> Rows:
         """The best of `starts` initial poses of every candidate."""
@@ -189,38 +166,20 @@ class Search:
         every = torch.cat(self._points)
         return every[(starts[part] + (share * sizes[part]).long()).to(every.device)]
 
-    def _step(self, rows: Rows, step: int, generator: torch.Generator) -> Evaluation:
-        settings = self.settings
-        done = step / settings.iterations
-        ramp = 1 + (settings.ramp - 1) * max(0.0, done - settings.ramp_start) / (1 - settings.ramp_start)
-        found = self.energy(rows.wrist, rows.joints, rows.contacts, ramp)
-        if step and step % settings.resample == 0 and done < settings.resample_until:
-            found = self._resample(rows, found, ramp, generator)
-        self.descend(rows, found, step, done)
-        return found
-
-    def _resample(self, rows: Rows, found: Evaluation, ramp: float, generator: torch.Generator) -> Evaluation:
+    def _resample(self, rows: Rows, ramp: float, generator: torch.Generator) -> None:
         """Draw half of the contact points anew; keep them where the energy is lower."""
         fresh = self.draw_contacts(len(rows), generator)
         stay = (torch.rand(fresh.shape, generator=generator) < 0.5).to(fresh.device)
         fresh = torch.where(stay, rows.contacts, fresh)
-        other = self.energy(rows.wrist, rows.joints, fresh, ramp)
-        better = other.total < found.total
-        rows.contacts = torch.where(better.unsqueeze(1), fresh, rows.contacts)
-        return Evaluation(
-            torch.where(better, other.total, found.total),
-            {name: torch.where(better, other.terms[name], value) for name, value in found.terms.items()},
-            torch.where(better.unsqueeze(1), other.wrist, found.wrist),
-            torch.where(better.unsqueeze(1), other.joints, found.joints),
-        )
+        now, then = (self.energy(rows.wrist, rows.joints, points, ramp).total for points in (rows.contacts, fresh))
+        rows.contacts = torch.where((then < now).unsqueeze(1), fresh, rows.contacts)
 
     def polish(self, rows: Rows, iterations: int) -> Rows:
         """Descend from where rows are: full weights on overlaps, the nearest points as contacts."""
         settings, hand = self.settings, self.energy.hand
         rows = Rows.begin(rows.wrist, rows.joints, self.nearest_contacts(rows), rows.total)
-        for step in range(iterations):
-            found = self.energy(rows.wrist, rows.joints, rows.contacts, settings.ramp)
-            self.descend(rows, found, step, step / iterations, POLISH_STEP)
+        sizes = [POLISH_STEP * fading(step / iterations) for step in range(iterations)]
+        self.polishing(rows, Schedule(0, [settings.ramp] * iterations, sizes))
         rows.joints = torch.clamp(rows.joints, hand.lower, hand.upper)
         return rows
 
@@ -237,17 +196,7 @@ class Search:
         gap[:, 0] = -1.0
         return torch.take_along_dim(index, gap.argsort(1)[:, : self.settings.contacts], 1)
 
-    def descend(self, rows: Rows, found: Evaluation, step: int, done: float, scale: float = 1.0) -> None:
-        """One Adam step with a cosine schedule in the share `done`; rotations move along their tangent."""
-        gradient = torch.cat((found.wrist, found.joints), 1)
-        rows.mean.lerp_(gradient, 1 - MEAN_DECAY)
-        rows.square.lerp_(gradient.square(), 1 - SQUARE_DECAY)
-        mean = rows.mean / (1 - MEAN_DECAY ** (step + 1))
-        root = (rows.square / (1 - SQUARE_DECAY ** (step + 1))).sqrt_().add_(1e-8)
-        size = scale * (LAST_STEP + (1 - LAST_STEP) * 0.5 * (1 + math.cos(math.pi * done)))
-        move = -size * self._steps * mean / root
-        rows.wrist[:, :3, 3] += move[:, :3]
-        half = torch.nn.functional.pad(0.5 * move[:, 3:6], (1, 0), value=1.0)
-        turn = matrix_from_quaternion(torch.nn.functional.normalize(half, dim=-1))
-        rows.wrist[:, :3, :3] = turn @ rows.wrist[:, :3, :3]
-        rows.joints = rows.joints + move[:, 6:]
+
+def fading(done: float) -> float:
+    """Cosine schedule of step sizes: from 1 at `done` = 0 to `LAST_STEP` at 1."""
+    return LAST_STEP + (1 - LAST_STEP) * 0.5 * (1 + math.cos(math.pi * done))

@@ -102,9 +102,13 @@ class Surface:
 
     def contacts(self, candidates: GraspCandidates, row: int, hand: HandModel) -> UInt8[np.ndarray, "f 4"]:
         """Face colours of the contact semantic map of one candidate."""
+        return colours(self.parts(candidates, row, hand), tuple(PARTS.values()))
+
+    def parts(self, candidates: GraspCandidates, row: int, hand: HandModel) -> Int[np.ndarray, " f"]:
+        """The contact semantic map of one candidate: what touches each face, an index into `PARTS`."""
         one = candidates.select([row])
         part = contact_semantic_map(self.centres, one.position, one.quaternion, one.joints, hand)
-        return colours(part[0].numpy(), tuple(PARTS.values()))
+        return part[0].numpy()
 
     def painted(self, face_colours: UInt8[np.ndarray, "f 4"]) -> trimesh.Trimesh:
         """The mesh in these colours, faces not sharing vertices."""

@@ -25,23 +25,52 @@ ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "valid per second": lambda r: f"{r['valid_per_second']:.1f}",
     "penetration, median / p90 / max": lambda r: _lengths(r["penetration_mm"]),
     "self-penetration, median / p90 / max": lambda r: _lengths(r["self_penetration_mm"]),
-    "classes of the valid": lambda r: ", ".join(f"{n} {c}" for n, c in r["classes"].items()) or "-",
+    "classes of the valid": lambda r: (
+        ", ".join(f"{n} {c} ({_percent(r['class_shares'][n])})" for n, c in r["classes"].items()) or "-"
+    ),
 }
 """Rows of the printed table, followed by the medians of the energy terms."""
 
 
 def print_report(report: dict[str, Any], console: Console | None = None) -> None:
-    """Print a summary and, beside it, the baselines that it holds under "baselines"."""
-    baselines = report.get("baselines", {})
+    """Print a summary and, beside it, those that it holds under "baselines" and "by_region"; below, the votes."""
+    console = console or Console()
+    beside = report.get("by_region", {}) | report.get("baselines", {})
     table = Table(title=f"{report['object']}, {report['region'] or 'any region'}, {report['robot']}")
     table.add_column()
-    for name in ("grasps", *baselines):
+    for name in ("grasps", *beside):
         table.add_column(name.replace("_", " "), overflow="fold")
     for name, cell in ROWS.items():
-        table.add_row(name, *(cell(column) for column in (report, *baselines.values())))
+        table.add_row(name, *(cell(column) for column in (report, *beside.values())))
     for name in report["energy"]:
-        table.add_row(f"energy: {name}", *(f"{column['energy'][name]:.3g}" for column in (report, *baselines.values())))
-    (console or Console()).print(table)
+        table.add_row(f"energy: {name}", *(_energy(column, name) for column in (report, *beside.values())))
+    console.print(table)
+    if "voting" in report:
+        console.print(_votes(report["voting"]))
+
+
+def _energy(column: dict[str, Any], name: str) -> str:
+    return f"{column['energy'][name]:.3g}" if name in column["energy"] else "-"
+
+
+def _votes(voting: dict[str, Any]) -> Table:
+    """Recalls and confusion of the votes by the region that carries most force."""
+    labels = voting["labels"]
+    table = Table(title="part that carries most force after closing, and what the contacts vote for")
+    for heading in ("grasps", "contacts", "balanced accuracy", *(f"{name} held: voted" for name in labels)):
+        table.add_column(heading, overflow="fold")
+    for group in ("all", "clear"):
+        for kind in ("candidate", "closed_hand"):
+            found = voting[group][kind]
+            cells = [_confused(row, [*labels, "none"]) for row in found["confusion"]]
+            accuracy = found["balanced_accuracy"]
+            share = "-" if accuracy is None else f"{accuracy:.3f}"
+            table.add_row(f"{group} ({voting[group]['grasps']})", kind.replace("_", " "), share, *cells)
+    return table
+
+
+def _confused(row: list[int], names: list[str]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in zip(names, row, strict=True) if count) or "-"
 
 
 def check_out(out: Path) -> None:

@@ -5,21 +5,25 @@ from __future__ import annotations
 import hashlib
 import json
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Int
 from torch import Tensor
 
+from dora.affordance.agreement import Agreement, clearly_held
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.energies import Weights
+from dora.affordance.map import AffordanceMap
 from dora.affordance.optimise import Settings, optimise
 from dora.affordance.protocol import STANDARD, Protocol
 from dora.affordance.structure import AffordanceObject
+from dora.affordance.voting import vote
 from dora.progress import PhaseProgress
 from dora.robot import RobotDescription
-from dora.sim.validation import validate
+from dora.sim.validation import Validation, validate
 
 MILLIMETRES = 1000.0
 """Per metre."""
@@ -31,20 +35,26 @@ BASELINES = {
 closed around the object after them, which would mend much of it."""
 
 
+CANDIDATE, CLOSED = "candidate", "closed_hand"
+"""Which contacts vote: those at the candidate, or those of the simulated hand after closing."""
+FREE = "any"
+"""Name of a search without a region."""
+
+
 @dataclass(frozen=True, eq=False)
 class Generated:
     """Candidates with the verdict on each, and what it took.
 
     Attributes:
         candidates: all that the search gave; `valid` if they passed the simulation (when there was one) and stay
-            below the protocol's penetration; without a simulation, if they touch and stay below it.
+            below the protocol's penetration; without a simulation, if they touch and stay below it. Once simulated,
+            their class is what the contacts of the closed hand vote for.
         requested: number asked for.
         region: label asked for, None for a free search.
         seed: of the search.
         optimise_seconds, validate_seconds: wall time [s].
-        passed: (c,) whether the simulation was passed; None without one.
-        strict: (c,) valid, and within the strict limits of self-penetration and of motion while closing; None
-            without a simulation.
+        verdict: of the simulation; None without one.
+        voting: votes of the contacts at the candidate and of those of the closed hand; empty without a simulation.
     """
 
     candidates: GraspCandidates
@@ -53,8 +63,8 @@ class Generated:
     seed: int
     optimise_seconds: float
     validate_seconds: float
-    passed: Bool[Tensor, " c"] | None
-    strict: Bool[Tensor, " c"] | None
+    verdict: Validation | None
+    voting: dict[str, Tensor]
 
 
 def generate(
@@ -91,17 +101,18 @@ def generate(
     report = phases.phase(f"{name}: search", "candidates", scale=1 / settings.iterations)
     found = optimise(obj, robot, num, seed, region, settings, progress=report)
     between = time.perf_counter()
-    passed = strict = None
+    verdict, voting = None, {}
     if simulate:
         verdict = validate(found, obj, robot, protocol, progress=phases.phase(f"{name}: simulation", "candidates"))
-        passed, valid, strict = verdict.passed, verdict.valid, verdict.strict
+        valid, voting = verdict.valid, votes(found, verdict, obj)
+        found = replace(found, grasp_class=_classes(found, voting[CLOSED], obj))
     else:
         valid = (found.penetration <= protocol.penetration) & (found.contact_finger > 0).any(1)
     end = time.perf_counter()
     judged = repr(protocol) if simulate else None
     origin = {"search": found.settings, "region": region, "seed": seed, "protocol": judged}
     candidates = replace(found, valid=valid, settings=json.dumps(origin))
-    return Generated(candidates, num, region, seed, between - start, end - between, passed, strict)
+    return Generated(candidates, num, region, seed, between - start, end - between, verdict, voting)
 
 
 def summary(generated: Generated) -> dict[str, Any]:
@@ -110,7 +121,8 @@ def summary(generated: Generated) -> dict[str, Any]:
     `penetration_mm` and `energy` are over all candidates, `classes` counts the valid ones.
     """
     c = generated.candidates
-    valid = int(c.valid.sum())
+    valid, verdict = int(c.valid.sum()), generated.verdict
+    counts = c.select(c.valid).counts() if valid else {}
     seconds = generated.optimise_seconds + generated.validate_seconds
     return {
         "object": c.object,
@@ -121,12 +133,13 @@ def summary(generated: Generated) -> dict[str, Any]:
         "valid_per_second": valid / seconds,
         "optimise_seconds": generated.optimise_seconds,
         "validate_seconds": generated.validate_seconds,
-        "sim_success_rate": _share(generated.passed),
+        "sim_success_rate": _share(verdict and verdict.passed),
         "valid_share": _share(c.valid),
-        "strict_share": _share(generated.strict),
+        "strict_share": _share(verdict and verdict.strict),
         "penetration_mm": _spread(c.penetration),
         "self_penetration_mm": _spread(c.self_penetration),
-        "classes": c.select(c.valid).counts() if valid else {},
+        "classes": counts,
+        "class_shares": {name: count / valid for name, count in counts.items()},
         "energy": {name: float(value.median()) for name, value in c.energy.items()},
         "region": generated.region,
         "seed": generated.seed,
@@ -148,6 +161,59 @@ def baselines(
         name: summary(generate(obj, robot, num, seed, region, phases, simulate, settings, name=name))
         for name, settings in BASELINES.items()
     }
+
+
+def by_region(
+    obj: AffordanceObject, robot: RobotDescription, num: int, seed: int, region: str | None, phases: PhaseProgress
+) -> dict[str, Generated]:
+    """Simulated grasps of a free search ("any") and of one for each region, but for the one that is `region`.
+
+    Other arguments as of `generate`.
+    """
+    others = {FREE: None} | {label: label for label in obj.labels}
+    return {
+        name: generate(obj, robot, num, seed, label, phases, name=name)
+        for name, label in others.items()
+        if label != region
+    }
+
+
+def votes(candidates: GraspCandidates, verdict: Validation, obj: AffordanceObject) -> dict[str, Int[Tensor, " c"]]:
+    """Regions that the contacts vote for, at the candidate and after closing; -1 without contact."""
+    regions = AffordanceMap.from_object(obj)
+    return {
+        CANDIDATE: vote(regions, candidates.contacts.cpu(), candidates.contact_finger.cpu()),
+        CLOSED: vote(regions, verdict.contacts, verdict.contact_finger),
+    }
+
+
+def voting_summary(several: Iterable[Generated], obj: AffordanceObject) -> dict[str, Any]:
+    """Agreement of the votes with the region that carries most contact force after closing, as JSON can hold it.
+
+    Over the simulated grasps of all searches together whose hand presses on the object after closing: "all", and
+    "clear" where one region carries two thirds of the force or more.
+    """
+    simulated = [(g.verdict, g.voting) for g in several if g.verdict is not None]
+    force = torch.cat([verdict.label_force for verdict, _ in simulated])
+    voted = {kind: torch.cat([votes[kind] for _, votes in simulated]) for kind in (CANDIDATE, CLOSED)}
+    groups = {"all": force.sum(1) > 0, "clear": clearly_held(force)}
+    found: dict[str, Any] = {"labels": list(obj.labels)}
+    for group, rows in groups.items():
+        found[group] = {"grasps": int(rows.sum())}
+        for kind, choice in voted.items():
+            agreement = Agreement.of(obj.labels, choice[rows], force[rows].argmax(1))
+            found[group][kind] = {
+                "balanced_accuracy": agreement.balanced_accuracy,
+                "recall": agreement.recall,
+                "confusion": agreement.confusion.tolist(),
+            }
+    return found
+
+
+def _classes(candidates: GraspCandidates, voted: Int[Tensor, " c"], obj: AffordanceObject) -> tuple[str, ...]:
+    """The classes of what is voted for; where nothing is, the candidates' own."""
+    own = candidates.grasp_class
+    return tuple(obj.classes[label] if label >= 0 else own[row] for row, label in enumerate(voted.tolist()))
 
 
 def origin_digest(candidates: GraspCandidates) -> str:

@@ -85,6 +85,9 @@ class Validation:
         part_force: (c, parts) contact force after closing on the palm and on each finger: magnitudes of the impulses
             at the contact points over the time of the step, added up [N].
         label_force: (c, labels) the same by the region of the object in which the contact points lie [N].
+        contacts: (c, k, 3) contact points that carry force after closing, in the object frame [m]; rows are filled up
+            with zeros.
+        contact_finger: (c, k) what presses there: 0 nothing, 1 palm, 2 thumb, ... 6 pinky.
         candidate_penetration: (c,) overlap of hand and object at the candidate, from the candidates [m].
         self_penetration: (c,) overlap of the hand with itself at the candidate, from the candidates [m].
         protocol: what was done.
@@ -96,6 +99,8 @@ class Validation:
     penetration: Float[Tensor, " c"]
     part_force: Float[Tensor, "c parts"]
     label_force: Float[Tensor, "c labels"]
+    contacts: Float[Tensor, "c k 3"]
+    contact_finger: Int[Tensor, "c k"]
     candidate_penetration: Float[Tensor, " c"]
     self_penetration: Float[Tensor, " c"]
     protocol: Protocol
@@ -220,6 +225,7 @@ def validate(
     trials = run_cases(GripTest, (obj, robot, protocol, physics or Physics()), _cases(candidates), processes, progress)
     parts = 1 + len(robot.fingers)
     grips = [trial.grip for trial in trials]
+    points, finger = _pressed(grips)
     numbers = torch.tensor([(t.displacement, t.closing_shift, t.penetration) for t in trials])
     return Validation(
         reason=torch.tensor([int(trial.reason) for trial in trials]),
@@ -228,6 +234,8 @@ def validate(
         penetration=numbers[:, 2],
         part_force=torch.tensor(np.array([_part_force(grip, parts) for grip in grips]), dtype=torch.float32),
         label_force=_label_force(grips, obj),
+        contacts=points,
+        contact_finger=finger,
         candidate_penetration=candidates.penetration.cpu(),
         self_penetration=candidates.self_penetration.cpu(),
         protocol=protocol,
@@ -249,6 +257,18 @@ def _cases(candidates: GraspCandidates) -> list[Case]:
 
 def _part_force(grip: Grip | None, parts: int) -> np.ndarray:
     return np.zeros(parts) if grip is None else grip.by_part(parts)
+
+
+def _pressed(grips: list[Grip | None]) -> tuple[Float[Tensor, "c k 3"], Int[Tensor, "c k"]]:
+    """Points that carry force and their contact classes, filled up to the largest number of them."""
+    pressing = [np.zeros(0, np.int64) if grip is None else np.flatnonzero(grip.force > 0) for grip in grips]
+    most = max(map(len, pressing))
+    points, finger = torch.zeros(len(grips), most, 3), torch.zeros(len(grips), most, dtype=torch.long)
+    for row, (grip, index) in enumerate(zip(grips, pressing, strict=True)):
+        if grip is not None:
+            points[row, : len(index)] = torch.tensor(grip.point[index], dtype=torch.float32)
+            finger[row, : len(index)] = torch.tensor(1 + grip.part[index])
+    return points, finger
 
 
 def _label_force(grips: list[Grip | None], obj: AffordanceObject) -> Float[Tensor, "c labels"]:

@@ -192,8 +192,9 @@ class HammerEnv(DoraEnv):
             for name, p in points.items()
         }
         self.object_half = factor * torch.tensor(hammer.mesh.extents / 2, dtype=torch.float32, device=self.device)
+        offset = self.sim_config.scene_config.contact_offset
         actor = build_object(
-            self.scene, hammer, scale=scale, friction=FRICTION, contact_offset=self.sim_config.scene_config.contact_offset,
+            self.scene, hammer, scale=scale, friction=FRICTION, contact_offset=offset,
             pose=sapien.Pose([*RELEASE[:2], RELEASE[2] + 0.5]),
         )  # fmt: skip
         self.nail = Nail(self.scene, NAIL_TOP, 1 / self.sim_freq)

@@ -9,9 +9,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dora.affordance.native.compiling import native
-from dora.affordance.native.field import FieldArrays, coarse, sample
-from dora.affordance.native.hand import SMALL, HandArrays, cross, forward, point_of, pull_back, push, self_penetration
+from dora.affordance.native.compiling import inlined, native
+from dora.affordance.native.field import FieldArrays, coarse, distance_to
+from dora.affordance.native.hand import (
+    SMALL,
+    HandArrays,
+    cross,
+    forward,
+    point_of,
+    pull_back,
+    push,
+    self_penetration,
+    turn,
+)
 
 STIFFNESS = 4e3
 """Of the contact of one sphere, across and along the surface (N/m); grips overlap by millimetres then."""
@@ -29,8 +39,6 @@ SPARE = 5.0
 """Contacts on whose stiffness the step sizes count in addition to those that exist."""
 LOST = 0.06
 """Displacement (m) at which a grasp is given up."""
-NO_TURN = 1e-12
-"""Angle (rad) of a step that does not turn."""
 
 
 class Drives(NamedTuple):
@@ -47,6 +55,15 @@ class Steps(NamedTuple):
     closing: int = 60
     settling: int = 20
     weight: int = 20
+
+
+class Ranking(NamedTuple):
+    """Quality of a candidate, log(1 + force/N) less (displacement + `shift_share` shift) / `much` (m), and how many of
+    the best are `wanted`: the others are given up as soon as it is certain that they are not among them."""
+
+    much: float
+    shift_share: float
+    wanted: int
 
 
 class Model(NamedTuple):
@@ -83,17 +100,17 @@ class _Scratch(NamedTuple):
     poses: np.ndarray
     wrench: np.ndarray
     gradient: np.ndarray
-    value: np.ndarray
-    slope: np.ndarray
+    ends: np.ndarray
 
 
 @native
-def close_and_load(model, steps, load, directions, wrists, opened, squeezed):
+def close_and_load(model, steps, ranking, load, directions, wrists, opened, squeezed):
     """Closes every hand from `opened` to `squeezed` (c, j), then lets a weight act along each direction in turn.
 
     Args:
         model: a `Model`.
         steps: a `Steps`.
+        ranking: a `Ranking`.
         load: the weight (N).
         directions: (d, 3) of the weight in the object frame.
         wrists: (c, 4, 4) poses in the object frame; after closing on return.
@@ -102,23 +119,38 @@ def close_and_load(model, steps, load, directions, wrists, opened, squeezed):
 
     Returns:
         (c, 2 + d): shift of the object by closing (m), sum of normal forces (N), and the farthest it has been from
-        there up to each direction (m).
+        there up to each direction (m), up to when it was given up.
     """
     count, joints = opened.shape
-    result = np.zeros((count, 2 + len(directions)))
-    state, scratch = _room(len(model.hand.sphere_body), joints)
+    result, best = np.zeros((count, 2 + len(directions))), np.full(ranking.wanted, -np.inf)
+    state, scratch = _room(len(model.hand.sphere_body), joints, len(model.hand.ends))
     for row in range(count):
         start = wrists[row].copy()
         _begin(state, start, opened[row])
-        result[row, 1] = _close(model, steps, opened[row].copy(), squeezed[row], state, scratch)
+        force = _close(model, steps, opened[row].copy(), squeezed[row], state, scratch)
         wrists[row, :, :], opened[row, :] = state.wrist, state.joints
-        result[row, 0] = _moved(state.wrist, start)
-        _load(model, steps.weight, load, directions, start, wrists[row], state, scratch, result[row, 2:])
+        shift = _moved(state.wrist, start)
+        result[row, 0], result[row, 1] = shift, force
+        unmoved = math.log1p(force) - ranking.shift_share * shift / ranking.much
+        limit = min(LOST, (unmoved - best[0]) * ranking.much)
+        far = _load(model, steps.weight, load, directions, start, wrists[row], limit, state, scratch, result[row, 2:])
+        _insert(best, unmoved - far / ranking.much)
     return result
 
 
 @native
-def _room(spheres, joints):
+def _insert(best, quality):
+    """Puts a quality into the ascending list of the best ones, whose first leaves."""
+    if quality > best[0]:
+        place = 1
+        while place < len(best) and best[place] < quality:
+            best[place - 1] = best[place]
+            place += 1
+        best[place - 1] = quality
+
+
+@native
+def _room(spheres, joints, ends):
     """State and scratch of a hand."""
     state = _State(
         np.zeros((4, 4)),
@@ -137,8 +169,7 @@ def _room(spheres, joints):
         np.zeros((bodies, 3, 4)),
         np.zeros((bodies, 6)),
         np.zeros(6 + joints),
-        np.zeros(1),
-        np.zeros((1, 3)),
+        np.zeros((ends, 3)),
     )
     return state, scratch
 
@@ -168,12 +199,13 @@ def _close(model, steps, opened, squeezed, state, scratch):
 
 
 @native
-def _load(model, steps, load, directions, start, settled, state, scratch, farthest):
-    """The weight along each direction in turn; `farthest` (d,) gets the farthest from the settled place (m)."""
+def _load(model, steps, load, directions, start, settled, limit, state, scratch, farthest):
+    """The weight along each direction in turn, until the object is `limit` (m) from the settled place; `farthest` (d,)
+    gets the farthest it has been (m), which is returned, too."""
     far = 0.0
     for d in range(len(directions)):
         for _ in range(steps):
-            if far < LOST:
+            if far < limit:
                 for i in range(3):
                     state.weight[i] = 0.0
                     for k in range(3):
@@ -182,6 +214,7 @@ def _load(model, steps, load, directions, start, settled, state, scratch, farthe
                 _relax(model, state, scratch)
                 far = max(far, _moved(state.wrist, settled))
         farthest[d] = far
+    return far
 
 
 @native
@@ -202,88 +235,97 @@ def _origin(wrist, axis):
 @native
 def _relax(model, state, scratch):
     """One step of descent of all forces; returns the sum of normal forces (N)."""
-    hand, drives, joints = model.hand, model.drives, state.joints
+    hand, drives, joints, command, speed = model.hand, model.drives, state.joints, state.command, state.speed
     poses, wrench, gradient = scratch.poses, scratch.wrench, scratch.gradient
     forward(hand, state.wrist, joints, 0.0, scratch.angles, poses)
     wrench[:] = 0.0
     gradient[:] = 0.0
-    total, contacts = 0.0, SPARE
-    for s in range(len(hand.sphere_body)):
-        if model.plane[3] < np.inf:
-            _rest_on(hand, model.plane, poses, s, wrench)
-        normal = _touch(model, state, scratch, s)
-        if normal > 0.0:
-            total += normal
-            contacts += 1
-    self_penetration(hand, 0.0, STIFFNESS, poses, wrench)
+    if model.plane[3] < np.inf:
+        _rest_on(hand.sphere_body, hand.sphere_local, hand.sphere_radius, model.plane, poses, wrench)
+    total, contacts = _touch(hand, model.field, model.friction, state, poses, wrench)
+    self_penetration(hand, 0.0, STIFFNESS, poses, scratch.ends, wrench)
     push(wrench, 0, (0.0, 0.0, 0.0), state.weight)
     pull_back(hand, poses, wrench, gradient)
     for j in range(len(joints)):
-        torque = drives.stiffness[j] * (joints[j] - state.command[j])
+        torque = drives.stiffness[j] * (joints[j] - command[j])
         torque = min(max(torque, -drives.effort[j]), drives.effort[j])
-        state.speed[6 + j] = MOMENTUM * state.speed[6 + j] - (gradient[6 + j] + torque) * drives.step[j]
-        step = min(max(state.speed[6 + j], -LARGEST_TURN), LARGEST_TURN)
+        speed[6 + j] = MOMENTUM * speed[6 + j] - (gradient[6 + j] + torque) * drives.step[j]
+        step = min(max(speed[6 + j], -LARGEST_TURN), LARGEST_TURN)
         joints[j] = min(max(joints[j] + step, hand.lower[j]), hand.upper[j])
-    _move(state.wrist, model.center, contacts * STIFFNESS, gradient, state.speed)
+    _move(state.wrist, model.center, (SPARE + contacts) * STIFFNESS, gradient, speed)
     return total
 
 
 @native
-def _touch(model, state, scratch, s):
-    """Contact of a sphere with the object, with Coulomb friction: its force goes to the wrench; returns its normal part
-    (N), 0 without contact."""
-    hand, field, anchor = model.hand, model.field, state.anchor
-    if state.wait[s] > 0:
-        state.wait[s] -= 1
-        return 0.0
-    body, radius = hand.sphere_body[s], hand.sphere_radius[s]
-    point = point_of(scratch.poses, body, hand.sphere_local, s)
-    beyond = coarse(field, point) - radius - field.cull
-    if beyond > 0.0:
-        state.touching[s] = False
-        state.wait[s] = int(beyond / APPROACH)
-        return 0.0
-    value, slope = scratch.value, scratch.slope
-    sample(field, field.distance, point, value, slope)
-    depth = radius - value[0]
-    if depth <= 0.0:
-        state.touching[s] = False
-        return 0.0
-    length = max(math.sqrt(slope[0, 0] ** 2 + slope[0, 1] ** 2 + slope[0, 2] ** 2), SMALL)
-    n = (slope[0, 0] / length, slope[0, 1] / length, slope[0, 2] / length)
-    normal = STIFFNESS * depth
-    if not state.touching[s]:
-        state.touching[s] = True
-        _hold_on(scratch.poses, body, point, n, radius, state.local, anchor, s)
-    here = point_of(scratch.poses, body, state.local, s)
+def _touch(hand, field, friction, state, poses, wrench):
+    """Contacts of all spheres with the object: their forces go to the wrench; returns the sum of normal forces (N) and
+    the number of contacts."""
+    body_of, centers, radii, wait, touching = (
+        hand.sphere_body,
+        hand.sphere_local,
+        hand.sphere_radius,
+        state.wait,
+        state.touching,
+    )
+    total, contacts = 0.0, 0
+    for s in range(len(body_of)):
+        if wait[s] > 0:
+            wait[s] -= 1
+            continue
+        body, radius = body_of[s], radii[s]
+        point = point_of(poses, body, centers, s)
+        beyond = coarse(field, point) - radius - field.cull
+        if beyond > 0.0:
+            touching[s] = False
+            wait[s] = int(beyond / APPROACH)
+            continue
+        value, slope = distance_to(field, point)
+        depth = radius - value
+        if depth <= 0.0:
+            touching[s] = False
+            continue
+        length = max(math.sqrt(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2), SMALL)
+        n = (slope[0] / length, slope[1] / length, slope[2] / length)
+        if not touching[s]:
+            touching[s] = True
+            _hold_on(poses, body, point, n, radius, state.local, state.anchor, s)
+        _push_out(poses, body, s, n, STIFFNESS * depth, friction, state.local, state.anchor, wrench)
+        total += STIFFNESS * depth
+        contacts += 1
+    return total, contacts
+
+
+@inlined
+def _push_out(poses, body, s, n, normal, friction, local, anchor, wrench):
+    """A contact's normal force (N) and Coulomb friction, whose anchor follows when it slides."""
+    here = point_of(poses, body, local, s)
     slip = (here[0] - anchor[s, 0], here[1] - anchor[s, 1], here[2] - anchor[s, 2])
     along = slip[0] * n[0] + slip[1] * n[1] + slip[2] * n[2]
     t = (slip[0] - along * n[0], slip[1] - along * n[1], slip[2] - along * n[2])
     size = STIFFNESS * math.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
     share = 1.0
-    if size > model.friction * normal:
-        share = model.friction * normal / size
+    if size > friction * normal:
+        share = friction * normal / size
         for i in range(3):
             anchor[s, i] = here[i] - share * t[i]
     k = share * STIFFNESS
-    force = (k * t[0] - normal * n[0], k * t[1] - normal * n[1], k * t[2] - normal * n[2])
-    push(scratch.wrench, body, here, force)
-    return normal
+    push(wrench, body, here, (k * t[0] - normal * n[0], k * t[1] - normal * n[1], k * t[2] - normal * n[2]))
 
 
 @native
-def _rest_on(hand, plane, poses, s, wrench):
-    """The table pushes a sphere out."""
-    body = hand.sphere_body[s]
-    point = point_of(poses, body, hand.sphere_local, s)
-    height = plane[0] * point[0] + plane[1] * point[1] + plane[2] * point[2] + plane[3]
-    depth = hand.sphere_radius[s] - height
-    if depth > 0.0:
-        k = -STIFFNESS * depth
-        push(wrench, body, point, (k * plane[0], k * plane[1], k * plane[2]))
+def _rest_on(body_of, centers, radius, plane, poses, wrench):
+    """The table pushes spheres out."""
+    nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
+    for s in range(len(body_of)):
+        body = body_of[s]
+        point = point_of(poses, body, centers, s)
+        depth = radius[s] - (nx * point[0] + ny * point[1] + nz * point[2] + offset)
+        if depth > 0.0:
+            k = -STIFFNESS * depth
+            push(wrench, body, point, (k * nx, k * ny, k * nz))
 
 
-@native
+@inlined
 def _hold_on(poses, body, point, n, radius, local, anchor, s):
     """A sphere begins to touch: its material point and the object's point there."""
     for i in range(3):
@@ -297,10 +339,11 @@ def _hold_on(poses, body, point, n, radius, local, anchor, s):
 @native
 def _move(wrist, center, stiffness, gradient, speed):
     """Moves the wrist, which is the object seen from the hand, by a step about the middle of the grip."""
-    pivot, arm = np.empty(3), np.empty(3)
-    for i in range(3):
-        pivot[i] = wrist[i, 3] + wrist[i, 0] * center[0] + wrist[i, 1] * center[1] + wrist[i, 2] * center[2]
-        arm[i] = wrist[i, 3] - pivot[i]
+    arm = (
+        -(wrist[0, 0] * center[0] + wrist[0, 1] * center[1] + wrist[0, 2] * center[2]),
+        -(wrist[1, 0] * center[0] + wrist[1, 1] * center[1] + wrist[1, 2] * center[2]),
+        -(wrist[2, 0] * center[0] + wrist[2, 1] * center[1] + wrist[2, 2] * center[2]),
+    )
     lever = cross(arm, gradient)
     size = 0.0
     for i in range(3):
@@ -310,17 +353,6 @@ def _move(wrist, center, stiffness, gradient, speed):
     if size > LARGEST_STEP:
         for i in range(6):
             speed[i] *= LARGEST_STEP / size
-    angle = math.sqrt(speed[3] ** 2 + speed[4] ** 2 + speed[5] ** 2)
-    turn = np.eye(3)
-    if angle > NO_TURN:
-        a, b, c = speed[3] / angle, speed[4] / angle, speed[5] / angle
-        cosine, sine = math.cos(angle), math.sin(angle)
-        rest = 1 - cosine
-        turn[0, 0], turn[0, 1], turn[0, 2] = cosine + a * a * rest, a * b * rest - c * sine, a * c * rest + b * sine
-        turn[1, 0], turn[1, 1], turn[1, 2] = b * a * rest + c * sine, cosine + b * b * rest, b * c * rest - a * sine
-        turn[2, 0], turn[2, 1], turn[2, 2] = c * a * rest - b * sine, c * b * rest + a * sine, cosine + c * c * rest
-    old = wrist.copy()
+    turn(wrist, arm, (speed[3], speed[4], speed[5]))
     for i in range(3):
-        for k in range(3):
-            wrist[i, k] = turn[i, 0] * old[0, k] + turn[i, 1] * old[1, k] + turn[i, 2] * old[2, k]
-        wrist[i, 3] = pivot[i] + speed[i] + turn[i, 0] * arm[0] + turn[i, 1] * arm[1] + turn[i, 2] * arm[2]
+        wrist[i, 3] += speed[i]

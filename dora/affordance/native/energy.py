@@ -1,143 +1,238 @@
 """The grasp energy: the same values and gradients as `dora.affordance.energies.GraspEnergy`, which defines them."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from dora.affordance.energies import CLEARANCE, LENGTH, PALM_IMPORTANCE, PRESS, TERMS
 from dora.affordance.native.compiling import native
-from dora.affordance.native.field import coarse, sample
-from dora.affordance.native.hand import SMALL, cross, forward, point_of, pull_back, push, self_penetration
+from dora.affordance.native.field import coarse, distance_to, sample
+from dora.affordance.native.hand import SMALL, cross, forward, point_of, pull_back, push, self_penetration, turn
 from dora.affordance.signed_distance import CHANNELS
 
 _CLOSURE, _DISTANCE, _REGION, _CLOSING, _PENETRATION, _TABLE, _LIMITS, _SELF = range(len(TERMS))
+
+
+class _Room(NamedTuple):
+    """Room for what is computed on the way: of the hand, of a sample of the field, of every contact point."""
+
+    angles: np.ndarray
+    poses: np.ndarray
+    wrench: np.ndarray
+    ends: np.ndarray
+    value: np.ndarray
+    slope: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    lengths: np.ndarray
+    jacobian: np.ndarray
+
+
+class Adam(NamedTuple):
+    """As `dora.affordance.descent`: largest steps (6 + a,), their shares (n,), steps taken before, decays, smallest."""
+
+    largest: np.ndarray
+    size: np.ndarray
+    before: int
+    mean_decay: float
+    square_decay: float
+    smallest: float
 
 
 @native
 def evaluate(hand, field, weights, plane, wrist, joints, contacts):
     """Values of all terms (c, terms) and the gradient of their weighted sum (c, 6 + a)."""
     count, actuated = joints.shape
-    bodies, channels = len(hand.axes) + 1, field.table.shape[1]
     terms, gradient = np.zeros((count, len(weights))), np.zeros((count, 6 + actuated))
-    poses, closed = np.zeros((bodies, 3, 4)), np.zeros((bodies, 3, 4))
-    wrench, wrench_closed = np.zeros((bodies, 6)), np.zeros((bodies, 6))
-    angles, angles_closed = np.zeros(bodies - 1), np.zeros(bodies - 1)
-    value, slope = np.zeros(channels), np.zeros((channels, 3))
+    room = make_room(hand, field, contacts.shape[1])
     for row in range(count):
-        forward(hand, wrist[row], joints[row], 0.0, angles, poses)
-        forward(hand, wrist[row], joints[row], 1.0, angles_closed, closed)
-        wrench[:] = 0.0
-        wrench_closed[:] = 0.0
-        _contact_terms(hand, field, weights, poses, contacts[row], value, slope, terms[row], wrench)
-        terms[row, _CLOSING] = _closing(
-            hand, field, weights[_CLOSING], closed, contacts[row], value, slope, wrench_closed
+        _evaluate(
+            hand, field, weights, plane, wrist[row], joints[row], contacts[row], room, True, terms[row], gradient[row]
         )
-        _sphere_terms(hand, field, weights, plane, poses, value, slope, terms[row], wrench)
-        terms[row, _SELF] = self_penetration(hand, weights[_SELF], 0.0, poses, wrench)
-        terms[row, _LIMITS] = _limits(hand, weights[_LIMITS], angles, gradient[row])
-        pull_back(hand, poses, wrench, gradient[row])
-        pull_back(hand, closed, wrench_closed, gradient[row])
     return terms, gradient
 
 
 @native
-def _contact_terms(hand, field, weights, poses, contacts, value, slope, terms, wrench):
-    """closure, distance and region."""
-    count = len(contacts)
-    points, normals, lengths = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
-    jacobian = np.empty((count, 3, 3))
-    force, torque = np.zeros(3), np.zeros(3)
-    for k in range(count):
-        body = hand.contact_body[contacts[k]]
-        point = point_of(poses, body, hand.contact_local, contacts[k])
+def descend(hand, field, factors, plane, adam, wrist, joints, contacts, mean, square):
+    """Takes the steps of `Adam` with weights `factors` (n, terms); poses, joints and moments change in place.
+
+    Returns the terms (c, terms) before the last step.
+    """
+    count, actuated = joints.shape
+    terms, gradient = np.zeros((count, factors.shape[1])), np.zeros(6 + actuated)
+    pose, angles, m, v = np.zeros((3, 4)), np.zeros(actuated), np.zeros(6 + actuated), np.zeros(6 + actuated)
+    room = make_room(hand, field, contacts.shape[1])
+    for row in range(count):
+        pose[:], angles[:], m[:], v[:] = wrist[row, :3], joints[row], mean[row], square[row]
+        for step in range(len(factors)):
+            terms[row] = 0.0
+            gradient[:] = 0.0
+            _evaluate(hand, field, factors[step], plane, pose, angles, contacts[row], room, False, terms[row], gradient)
+            adam_step(adam, step, pose, angles, gradient, m, v)
+        wrist[row, :3], joints[row], mean[row], square[row] = pose, angles, m, v
+    return terms
+
+
+@native
+def adam_step(adam, step, pose, joints, gradient, mean, square):
+    """One step of Adam; `gradient` becomes the step."""
+    taken = adam.before + step + 1
+    scale = adam.size[step] / (1 - adam.mean_decay**taken)
+    unbias = 1 / (1 - adam.square_decay**taken)
+    for i in range(len(gradient)):
+        mean[i] += (1 - adam.mean_decay) * (gradient[i] - mean[i])
+        square[i] += (1 - adam.square_decay) * (gradient[i] ** 2 - square[i])
+        gradient[i] = -scale * adam.largest[i] * mean[i] / (math.sqrt(square[i] * unbias) + adam.smallest)
+    turn(pose, (0.0, 0.0, 0.0), (gradient[3], gradient[4], gradient[5]))
+    for i in range(3):
+        pose[i, 3] += gradient[i]
+    for j in range(len(joints)):
+        joints[j] += gradient[6 + j]
+
+
+@native
+def make_room(hand, field, contacts):
+    """Room for one candidate."""
+    bodies, channels = len(hand.axes) + 1, field.table.shape[1]
+    return _Room(
+        np.zeros(bodies - 1),
+        np.zeros((bodies, 3, 4)),
+        np.zeros((bodies, 6)),
+        np.zeros((len(hand.ends), 3)),
+        np.zeros(channels),
+        np.zeros((channels, 3)),
+        np.zeros((contacts, 3)),
+        np.zeros((contacts, 3)),
+        np.zeros(contacts),
+        np.zeros((contacts, 3, 3)),
+    )
+
+
+@native
+def _evaluate(hand, field, weights, plane, wrist, joints, contacts, room, every, terms, gradient):
+    """Adds the terms of one candidate and their gradient; if not `every` term is asked for, only those that count."""
+    poses, wrench = room.poses, room.wrench
+    if every or weights[_CLOSING] > 0.0:
+        forward(hand, wrist, joints, 1.0, room.angles, poses)
+        wrench[:] = 0.0
+        terms[_CLOSING] = closing(hand, field, weights[_CLOSING], poses, contacts, wrench)
+        pull_back(hand, poses, wrench, gradient)
+    forward(hand, wrist, joints, 0.0, room.angles, poses)
+    wrench[:] = 0.0
+    contact_terms(hand, field, weights, contacts, room, terms)
+    if every or weights[_CLOSURE] > 0.0:
+        terms[_CLOSURE] = closure(weights[_CLOSURE], hand.contact_body, contacts, room)
+    sphere_terms(hand, field, weights, plane, poses, terms, wrench)
+    terms[_SELF] = self_penetration(hand, weights[_SELF], 0.0, poses, room.ends, wrench)
+    terms[_LIMITS] = limits(hand, weights[_LIMITS], room.angles, gradient)
+    pull_back(hand, poses, wrench, gradient)
+
+
+@native
+def contact_terms(hand, field, weights, contacts, room, terms):
+    """distance and region; keeps points, normals and their derivatives for closure."""
+    body_of, local, poses, wrench = hand.contact_body, hand.contact_local, room.poses, room.wrench
+    value, slope, points, normals, lengths = room.value, room.slope, room.points, room.normals, room.lengths
+    last = len(value) - 1
+    for k in range(len(contacts)):
+        body = body_of[contacts[k]]
+        point = point_of(poses, body, local, contacts[k])
         sample(field, field.table, point, value, slope)
         importance = PALM_IMPORTANCE if body == 0 else 1.0
         terms[_DISTANCE] += importance * abs(value[0])
         pull = weights[_DISTANCE] * importance * np.sign(value[0])
         along = 0.0
-        if len(value) > CHANNELS:
+        if last >= CHANNELS:
             terms[_REGION] += value[CHANNELS]
             along = weights[_REGION]
-        last = len(value) - 1
-        push(
-            wrench,
-            body,
-            point,
-            (
-                pull * slope[0, 0] + along * slope[last, 0],
-                pull * slope[0, 1] + along * slope[last, 1],
-                pull * slope[0, 2] + along * slope[last, 2],
-            ),
+        force = (
+            pull * slope[0, 0] + along * slope[last, 0],
+            pull * slope[0, 1] + along * slope[last, 1],
+            pull * slope[0, 2] + along * slope[last, 2],
         )
-        lengths[k] = max(math.sqrt(value[1] ** 2 + value[2] ** 2 + value[3] ** 2), SMALL)
+        push(wrench, body, point, force)
+        length = max(math.sqrt(value[1] ** 2 + value[2] ** 2 + value[3] ** 2), SMALL)
+        lengths[k] = length
         for i in range(3):
-            points[k, i], normals[k, i] = point[i], -value[1 + i] / lengths[k]
+            points[k, i], normals[k, i] = point[i], -value[1 + i] / length
             for j in range(3):
-                jacobian[k, i, j] = slope[1 + i, j]
-        moment = cross(points[k], normals[k])
-        for i in range(3):
-            force[i] += normals[k, i]
-            torque[i] += moment[i] / LENGTH
-    for i in range(3):
-        terms[_CLOSURE] += force[i] ** 2 + torque[i] ** 2
-    by_point = np.empty(3)
-    for k in range(count):
-        lever, unit = cross(torque, points[k]), normals[k]
-        by_normal = (
-            2 * (force[0] + lever[0] / LENGTH),
-            2 * (force[1] + lever[1] / LENGTH),
-            2 * (force[2] + lever[2] / LENGTH),
-        )
-        along = unit[0] * by_normal[0] + unit[1] * by_normal[1] + unit[2] * by_normal[2]
-        turned = cross(unit, torque)
-        for i in range(3):
-            by_point[i] = 2 / LENGTH * turned[i]
-            for j in range(3):
-                by_point[i] -= (by_normal[j] - unit[j] * along) / lengths[k] * jacobian[k, j, i]
-            by_point[i] *= weights[_CLOSURE]
-        push(wrench, hand.contact_body[contacts[k]], points[k], by_point)
+                room.jacobian[k, i, j] = slope[1 + i, j]
 
 
 @native
-def _closing(hand, field, weight, poses, contacts, value, slope, wrench):
+def closure(weight, body_of, contacts, room):
+    """closure: the norm of the net wrench of unit forces along the normals. Points are pushed by the arms of their
+    normals, and by the normals' turning."""
+    points, normals, jacobian = room.points, room.normals, room.jacobian
+    fx = fy = fz = tx = ty = tz = 0.0
+    for k in range(len(contacts)):
+        moment = cross(points[k], normals[k])
+        fx, fy, fz = fx + normals[k, 0], fy + normals[k, 1], fz + normals[k, 2]
+        tx, ty, tz = tx + moment[0] / LENGTH, ty + moment[1] / LENGTH, tz + moment[2] / LENGTH
+    torque = (tx, ty, tz)
+    for k in range(len(contacts)):
+        point = (points[k, 0], points[k, 1], points[k, 2])
+        unit = (normals[k, 0], normals[k, 1], normals[k, 2])
+        lever, turned = cross(torque, point), cross(unit, torque)
+        x, y, z = fx + lever[0] / LENGTH, fy + lever[1] / LENGTH, fz + lever[2] / LENGTH
+        along = unit[0] * x + unit[1] * y + unit[2] * z
+        share = 1 / room.lengths[k]
+        x, y, z = share * (x - unit[0] * along), share * (y - unit[1] * along), share * (z - unit[2] * along)
+        by_point = (
+            2 * weight * (turned[0] / LENGTH - x * jacobian[k, 0, 0] - y * jacobian[k, 1, 0] - z * jacobian[k, 2, 0]),
+            2 * weight * (turned[1] / LENGTH - x * jacobian[k, 0, 1] - y * jacobian[k, 1, 1] - z * jacobian[k, 2, 1]),
+            2 * weight * (turned[2] / LENGTH - x * jacobian[k, 0, 2] - y * jacobian[k, 1, 2] - z * jacobian[k, 2, 2]),
+        )
+        push(room.wrench, body_of[contacts[k]], point, by_point)
+    return fx * fx + fy * fy + fz * fz + tx * tx + ty * ty + tz * tz
+
+
+@native
+def closing(hand, field, weight, poses, contacts, wrench):
     """closing: how far points of the fingers of a closed hand still are from being pressed in."""
+    body_of, local = hand.contact_body, hand.contact_local
     total = 0.0
     for k in range(len(contacts)):
-        body = hand.contact_body[contacts[k]]
+        body = body_of[contacts[k]]
         if body == 0:
             continue
-        point = point_of(poses, body, hand.contact_local, contacts[k])
-        sample(field, field.distance, point, value, slope)
-        miss = value[0] + PRESS
+        point = point_of(poses, body, local, contacts[k])
+        value, slope = distance_to(field, point)
+        miss = value + PRESS
         if miss > 0.0:
             total += miss
-            push(wrench, body, point, (weight * slope[0, 0], weight * slope[0, 1], weight * slope[0, 2]))
+            push(wrench, body, point, (weight * slope[0], weight * slope[1], weight * slope[2]))
     return total
 
 
 @native
-def _sphere_terms(hand, field, weights, plane, poses, value, slope, terms, wrench):
+def sphere_terms(hand, field, weights, plane, poses, terms, wrench):
     """penetration and table."""
-    for s in range(len(hand.sphere_body)):
-        body = hand.sphere_body[s]
-        point = point_of(poses, body, hand.sphere_local, s)
-        if coarse(field, point) < hand.sphere_reach[s] + field.cull:
-            sample(field, field.distance, point, value, slope)
-            depth = hand.sphere_reach[s] - value[0]
+    body_of, local, radius, reach = hand.sphere_body, hand.sphere_local, hand.sphere_radius, hand.sphere_reach
+    inside, below, cull = 0.0, 0.0, field.cull
+    nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3] - CLEARANCE
+    for s in range(len(body_of)):
+        body = body_of[s]
+        point = point_of(poses, body, local, s)
+        if coarse(field, point) < reach[s] + cull:
+            value, slope = distance_to(field, point)
+            depth = reach[s] - value
             if depth > 0.0:
-                terms[_PENETRATION] += depth
+                inside += depth
                 w = -weights[_PENETRATION]
-                push(wrench, body, point, (w * slope[0, 0], w * slope[0, 1], w * slope[0, 2]))
-        height = plane[0] * point[0] + plane[1] * point[1] + plane[2] * point[2] + plane[3]
-        depth = hand.sphere_radius[s] + CLEARANCE - height
+                push(wrench, body, point, (w * slope[0], w * slope[1], w * slope[2]))
+        depth = radius[s] - (nx * point[0] + ny * point[1] + nz * point[2] + offset)
         if depth > 0.0:
-            terms[_TABLE] += depth
+            below += depth
             w = -weights[_TABLE]
-            push(wrench, body, point, (w * plane[0], w * plane[1], w * plane[2]))
+            push(wrench, body, point, (w * nx, w * ny, w * nz))
+    terms[_PENETRATION] = inside
+    terms[_TABLE] = below
 
 
 @native
-def _limits(hand, weight, angles, gradient):
+def limits(hand, weight, angles, gradient):
     """limits: angles beyond their limits (rad)."""
     total = 0.0
     for joint in range(len(angles)):

@@ -5,10 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dora.affordance.native.compiling import native
+from dora.affordance.native.compiling import inlined, native
 
 SMALL = 1e-9
 """Length (m) below which a direction is not divided by it."""
+
+NO_TURN = 1e-12
+"""Angle (rad) of a step that does not turn."""
 
 
 class HandArrays(NamedTuple):
@@ -41,30 +44,27 @@ class HandArrays(NamedTuple):
 @native
 def forward(hand, wrist, joints, share, angles, poses):
     """Angles of all joints and poses (bodies, 3, 4) of a hand closed by a share of `close`."""
+    constant, cosines, sines, depth = hand.constant, hand.cosine, hand.sine, hand.depth
     for i in range(3):
         for k in range(4):
             poses[0, i, k] = wrist[i, k]
-    local = np.empty((3, 4))
     for joint in range(len(angles)):
         a = hand.leader[joint]
         angle = hand.offset[joint] + hand.gain[joint] * (joints[a] + share * hand.close[a])
         angles[joint] = angle
         cosine, sine = math.cos(angle), math.sin(angle)
+        above = 0 if joint % depth == 0 else joint
+        for k in range(4):
+            x = constant[joint, 0, k] + cosine * cosines[joint, 0, k] + sine * sines[joint, 0, k]
+            y = constant[joint, 1, k] + cosine * cosines[joint, 1, k] + sine * sines[joint, 1, k]
+            z = constant[joint, 2, k] + cosine * cosines[joint, 2, k] + sine * sines[joint, 2, k]
+            for i in range(3):
+                poses[joint + 1, i, k] = poses[above, i, 0] * x + poses[above, i, 1] * y + poses[above, i, 2] * z
         for i in range(3):
-            for k in range(4):
-                local[i, k] = (
-                    hand.constant[joint, i, k] + cosine * hand.cosine[joint, i, k] + sine * hand.sine[joint, i, k]
-                )
-        above = 0 if joint % hand.depth == 0 else joint
-        for i in range(3):
-            for k in range(4):
-                total = poses[above, i, 3] if k == 3 else 0.0
-                for m in range(3):
-                    total += poses[above, i, m] * local[m, k]
-                poses[joint + 1, i, k] = total
+            poses[joint + 1, i, 3] += poses[above, i, 3]
 
 
-@native
+@inlined
 def point_of(poses, body, local, index):
     """A point of a body (m) in the frame of the poses."""
     x, y, z = local[index, 0], local[index, 1], local[index, 2]
@@ -75,13 +75,13 @@ def point_of(poses, body, local, index):
     )
 
 
-@native
+@inlined
 def cross(a, b):
     """Cross product of two vectors of three components, as a tuple."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@native
+@inlined
 def push(wrench, body, point, force):
     """Adds a force at a point, and its moment about the origin, to the wrench on a body."""
     moment = cross(point, force)
@@ -91,26 +91,27 @@ def push(wrench, body, point, force):
 
 
 @native
-def self_penetration(hand, weight, stiffness, poses, wrench):
-    """Sum of overlaps (m); capsules part with a force of `weight` and of `stiffness` times the overlap."""
-    capsules = len(hand.radius)
-    ends, middle = np.empty((2 * capsules, 3)), np.empty((capsules, 3))
-    for e in range(2 * capsules):
-        ends[e, 0], ends[e, 1], ends[e, 2] = point_of(poses, hand.capsule_body[e // 2], hand.ends, e)
-    for c in range(capsules):
-        for i in range(3):
-            middle[c, i] = 0.5 * (ends[2 * c, i] + ends[2 * c + 1, i])
-    total, pairs, bound = 0.0, hand.pairs, hand.bound
+def self_penetration(hand, weight, stiffness, poses, ends, wrench):
+    """Sum of overlaps (m); capsules part with a force of `weight` and of `stiffness` times the overlap.
+
+    `ends` (2 capsules, 3) is room for the ends of the capsules' axes.
+    """
+    body, local, pairs, bound = hand.capsule_body, hand.ends, hand.pairs, hand.bound
+    for e in range(len(ends)):
+        ends[e, 0], ends[e, 1], ends[e, 2] = point_of(poses, body[e // 2], local, e)
+    total = 0.0
     for q in range(len(bound)):
-        a, b = pairs[q, 0], pairs[q, 1]
-        x, y, z = middle[a, 0] - middle[b, 0], middle[a, 1] - middle[b, 1], middle[a, 2] - middle[b, 2]
-        if x * x + y * y + z * z < bound[q]:
-            total += _overlap(hand, weight, stiffness, a, b, ends, wrench)
+        a, b = 2 * pairs[q, 0], 2 * pairs[q, 1]
+        x = ends[a, 0] + ends[a + 1, 0] - ends[b, 0] - ends[b + 1, 0]
+        y = ends[a, 1] + ends[a + 1, 1] - ends[b, 1] - ends[b + 1, 1]
+        z = ends[a, 2] + ends[a + 1, 2] - ends[b, 2] - ends[b + 1, 2]
+        if 0.25 * (x * x + y * y + z * z) < bound[q]:
+            total += _overlap(hand.radius, body, weight, stiffness, a // 2, b // 2, ends, wrench)
     return total
 
 
 @native
-def _overlap(hand, weight, stiffness, a, b, ends, wrench):
+def _overlap(radius, body, weight, stiffness, a, b, ends, wrench):
     """Overlap (m) of two capsules, and the forces that part them."""
     uu = vv = ww = uv = uw = vw = 0.0
     for i in range(3):
@@ -121,19 +122,19 @@ def _overlap(hand, weight, stiffness, a, b, ends, wrench):
     t = min(max((uv * s + vw) / max(vv, SMALL**2), 0.0), 1.0)
     s = min(max((uv * t - uw) / max(uu, SMALL**2), 0.0), 1.0)
     square = ww + s * s * uu + t * t * vv + 2 * (s * uw - t * vw - s * t * uv)
-    limit = hand.radius[a] + hand.radius[b]
+    limit = radius[a] + radius[b]
     if square >= limit * limit:
         return 0.0
     first, second = _between(ends, a, s), _between(ends, b, t)
     distance = math.sqrt(max(square, 0.0))
     w = -(weight + stiffness * (limit - distance)) / max(distance, SMALL)
     force = (w * (first[0] - second[0]), w * (first[1] - second[1]), w * (first[2] - second[2]))
-    push(wrench, hand.capsule_body[a], first, force)
-    push(wrench, hand.capsule_body[b], second, (-force[0], -force[1], -force[2]))
+    push(wrench, body[a], first, force)
+    push(wrench, body[b], second, (-force[0], -force[1], -force[2]))
     return limit - distance
 
 
-@native
+@inlined
 def _between(ends, capsule, share):
     """A point on a capsule's axis."""
     a, b = 2 * capsule, 2 * capsule + 1
@@ -146,25 +147,43 @@ def _between(ends, capsule, share):
 
 @native
 def pull_back(hand, poses, wrench, gradient):
-    """Adds the generalised forces of wrenches on the bodies to the gradient; as `HandModel.pull_back`."""
-    total, beyond = wrench[0].copy(), np.empty(6)
-    for joint in range(len(hand.axes) - 1, -1, -1):
-        body, axis = joint + 1, hand.axes[joint]
-        if joint % hand.depth == hand.depth - 1:
-            beyond[:] = 0.0
-        for i in range(6):
-            beyond[i] += wrench[body, i]
-        pose = poses[body]
-        lever = cross(pose[:, 3], beyond)
+    """Adds the generalised forces of wrenches on the bodies to the gradient; as `HandModel.pull_back`.
+
+    `wrench` is used up: every body's gets those of the bodies beyond it.
+    """
+    axes, leader, gain, depth = hand.axes, hand.leader, hand.gain, hand.depth
+    for joint in range(len(axes) - 1, -1, -1):
+        body = joint + 1
+        above = 0 if joint % depth == 0 else joint
+        beyond = (wrench[body, 0], wrench[body, 1], wrench[body, 2])
+        lever = cross((poses[body, 0, 3], poses[body, 1, 3], poses[body, 2, 3]), beyond)
         torque = 0.0
         for i in range(3):
-            turned = pose[i, 0] * axis[0] + pose[i, 1] * axis[1] + pose[i, 2] * axis[2]
-            torque += turned * (beyond[3 + i] - lever[i])
-        gradient[6 + hand.leader[joint]] += torque * hand.gain[joint]
-        if joint % hand.depth == 0:
-            for i in range(6):
-                total[i] += beyond[i]
-    lever = cross(poses[0, :, 3], total)
+            moment = wrench[body, 3 + i] - lever[i]
+            for k in range(3):
+                torque += poses[body, i, k] * axes[joint, k] * moment
+        gradient[6 + leader[joint]] += torque * gain[joint]
+        for i in range(6):
+            wrench[above, i] += wrench[body, i]
+    force = (wrench[0, 0], wrench[0, 1], wrench[0, 2])
+    lever = cross((poses[0, 0, 3], poses[0, 1, 3], poses[0, 2, 3]), force)
     for i in range(3):
-        gradient[i] += total[i]
-        gradient[3 + i] += total[3 + i] - lever[i]
+        gradient[i] += force[i]
+        gradient[3 + i] += wrench[0, 3 + i] - lever[i]
+
+
+@native
+def turn(wrist, arm, rotation):
+    """Turns the axes of a pose by a rotation vector (rad) about the point that lies at its origin less `arm` (m)."""
+    angle = math.sqrt(rotation[0] ** 2 + rotation[1] ** 2 + rotation[2] ** 2)
+    if angle < NO_TURN:
+        return
+    axis = (rotation[0] / angle, rotation[1] / angle, rotation[2] / angle)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    for k in range(4):
+        old = arm if k == 3 else (wrist[0, k], wrist[1, k], wrist[2, k])
+        side = cross(axis, old)
+        along = (1 - cosine) * (axis[0] * old[0] + axis[1] * old[1] + axis[2] * old[2])
+        for i in range(3):
+            new = cosine * old[i] + sine * side[i] + along * axis[i]
+            wrist[i, k] += new - old[i]

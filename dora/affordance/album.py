@@ -1,0 +1,57 @@
+"""The pictures that show an object and its grasps, as files: regions, some grasps, their contact semantic maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.hand import HandModel
+from dora.affordance.map import AffordanceMap
+from dora.affordance.pictures import caption, picture_contacts, picture_grasps
+from dora.affordance.structure import AffordanceObject
+from dora.affordance.viewing import Surface
+from dora.errors import InputError
+from dora.robot import RobotDescription
+
+SHOWN = 4
+"""Grasps in a picture."""
+
+
+def write_album(
+    obj: AffordanceObject, candidates: GraspCandidates | None, robot: RobotDescription, folder: Path
+) -> list[Path]:
+    """Write OBJECT-map.png and, with candidates, OBJECT-grasps.png and OBJECT-contacts.png; returns their paths.
+
+    Args:
+        obj: the object.
+        candidates: of this object, best first; `chosen` ones are shown.
+        robot: whose hand grasps.
+        folder: for the files.
+
+    Raises:
+        InputError: the folder or a file cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"Cannot make the folder {folder} ({error.strerror}): choose another one.") from error
+    paths = [folder / f"{obj.name}-{what}.png" for what in ("map", "grasps", "contacts")]
+    AffordanceMap.from_object(obj).picture(paths[0])
+    if candidates is None:
+        return paths[:1]
+    shown = candidates.select(chosen(candidates))
+    picture_grasps(shown, obj, robot, paths[1])
+    surface, hand = Surface(obj), HandModel(robot)
+    maps = [surface.parts(shown, row, hand) for row in range(len(shown))]
+    titles = [caption(shown, row) for row in range(len(shown))]
+    picture_contacts(surface.mesh, maps, titles, obj.name, paths[2])
+    return paths
+
+
+def chosen(candidates: GraspCandidates) -> list[int]:
+    """Rows of at most `SHOWN` grasps: the first valid one of every class, then the first of all others."""
+    valid = candidates.valid.nonzero()[:, 0].tolist() or list(range(len(candidates)))
+    names = candidates.grasp_class
+    first = [row for i, row in enumerate(valid) if names[row] not in {names[other] for other in valid[:i]}]
+    rest = [row for row in valid if row not in first]
+    return sorted((first + rest)[:SHOWN])

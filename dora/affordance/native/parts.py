@@ -1,0 +1,56 @@
+"""One part of an evaluation of the energy again and again, to measure how long it takes."""
+
+import numpy as np
+
+from dora.affordance.native.compiling import native
+from dora.affordance.native.energy import adam_step, closing, closure, contact_terms, limits, make_room, sphere_terms
+from dora.affordance.native.hand import forward, pull_back, self_penetration
+
+PARTS = (
+    "forward_kinematics",
+    "distance_region",
+    "closure",
+    "closing",
+    "penetration_table",
+    "self_penetration",
+    "limits",
+    "gradient",
+    "adam",
+)
+"""`distance_region` includes looking up the field at the contact points, of which closure is made, too; `closing` is
+without the kinematics of the closed hand; `gradient` leads from forces on bodies to wrist and joints."""
+_FORWARD, _TOUCH, _CLOSURE, _CLOSING, _SPHERES, _SELF, _LIMITS, _GRADIENT, _ADAM = range(len(PARTS))
+
+
+@native
+def repeat(part, times, hand, field, weights, plane, adam, wrist, joints, contacts):
+    """Does one of `PARTS` (its index) `times` times for every candidate; arguments as of `descend`."""
+    count, actuated = joints.shape
+    room, terms, gradient = make_room(hand, field, contacts.shape[1]), np.zeros(len(weights)), np.zeros(6 + actuated)
+    pose, angles, mean, square = np.zeros((3, 4)), np.zeros(actuated), np.zeros(6 + actuated), np.zeros(6 + actuated)
+    for row in range(count):
+        pose[:], angles[:] = wrist[row, :3], joints[row]
+        forward(hand, pose, angles, 0.0, room.angles, room.poses)
+        contact_terms(hand, field, weights, contacts[row], room, terms)
+        room.wrench[:] = 0.0
+        for _ in range(times):
+            if part == _FORWARD:
+                forward(hand, pose, angles, 0.0, room.angles, room.poses)
+            elif part == _TOUCH:
+                contact_terms(hand, field, weights, contacts[row], room, terms)
+            elif part == _CLOSURE:
+                closure(1.0, hand.contact_body, contacts[row], room)
+            elif part == _CLOSING:
+                closing(hand, field, 1.0, room.poses, contacts[row], room.wrench)
+            elif part == _SPHERES:
+                sphere_terms(hand, field, weights, plane, room.poses, terms, room.wrench)
+            elif part == _SELF:
+                self_penetration(hand, 1.0, 0.0, room.poses, room.ends, room.wrench)
+            elif part == _LIMITS:
+                limits(hand, 1.0, room.angles, gradient)
+            elif part == _GRADIENT:
+                room.wrench[:] = 0.0
+                pull_back(hand, room.poses, room.wrench, gradient)
+            elif part == _ADAM:
+                gradient[:] = 0.0
+                adam_step(adam, 0, pose, angles, gradient, mean, square)
