@@ -2,8 +2,9 @@
 
 import dataclasses
 import functools
+import multiprocessing
 import os
-import subprocess
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -14,30 +15,37 @@ from torch import Tensor
 from dora.agents.config import PPOConfig, RunConfig
 from dora.agents.evaluators import Evaluators
 from dora.agents.learner import make_learner
+from dora.errors import InputError
 
 EPISODES = 30
 """Three batches and a part of one."""
 CONFIG = RunConfig("Fake-v1", "ppo", "affordance", workers=2, eval_envs=8, learner=PPOConfig(hidden=(16,)))
 
 
+FAILURES: dict[str, Callable[[], Any]] = {
+    "ends": lambda: os._exit(3),
+    "fails": lambda: {}["no step here"],
+    "refuses": lambda: (_ for _ in ()).throw(InputError("The action is NaN.")),
+}
+"""What a step does in a helper."""
+
+
 class FailsElsewhere(PointMass):
     """A task that breaks in every process but the one named."""
 
-    def __init__(self, num_envs: int, home: int):
+    def __init__(self, num_envs: int, home: int, failure: str):
         super().__init__(num_envs)
-        self.home = home
+        self.home, self.failure = home, failure
 
     def step(self, action: Tensor) -> Any:
         if os.getpid() != self.home:
-            raise ValueError("no step here")
+            FAILURES[self.failure]()
         return super().step(action)
 
 
-def children() -> list[str]:
-    """Processes started by this one that evaluate."""
-    command = ["ps", "--ppid", str(os.getpid()), "-o", "pid=,args="]
-    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
-    return [line for line in lines if "spawn_main" in line]
+def children() -> int:
+    """Processes that this one has started and that have not ended."""
+    return len(multiprocessing.active_children())
 
 
 def test_processes_give_the_rows_of_one_process():
@@ -55,17 +63,26 @@ def test_processes_give_the_rows_of_one_process():
     policy.normaliser.shift.add_(1.0)  # another policy, whose weights have to arrive
     one, two = (evaluators.run(policy, EPISODES, 100) for evaluators in (alone, shared))
     assert torch.equal(one.table, two.table)
-    assert len(children()) == len(before) + 1
+    assert children() == before + 1
     alone.close()
     shared.close()
     assert children() == before
 
 
-def test_a_failing_helper_is_reported_and_ended():
-    evaluators = Evaluators(functools.partial(FailsElsewhere, CONFIG.eval_envs, os.getpid()), CONFIG)
-    with pytest.raises(RuntimeError, match="ValueError: no step here"):
+@pytest.mark.parametrize(
+    ("failure", "error", "message"),
+    [
+        ("ends", RuntimeError, "ended with status 3"),
+        ("fails", RuntimeError, "KeyError: 'no step here'"),
+        ("refuses", InputError, "^The action is NaN.$"),
+    ],
+)
+def test_a_failing_helper_is_reported_and_ended(failure: str, error: type[Exception], message: str):
+    make = functools.partial(FailsElsewhere, CONFIG.eval_envs, os.getpid(), failure)
+    evaluators = Evaluators(make, CONFIG)
+    with pytest.raises(error, match=message):
         evaluators.run(None, EPISODES, 0)
-    assert not children()
+    assert children() == 0
     evaluators.close()
 
 
@@ -76,5 +93,5 @@ def test_an_interrupt_ends_the_helpers():
     evaluators = Evaluators(functools.partial(PointMass, CONFIG.eval_envs), CONFIG)
     with pytest.raises(KeyboardInterrupt):
         evaluators.run(None, EPISODES, 0, interrupted)
-    assert not children()
+    assert children() == 0
     evaluators.close()

@@ -148,3 +148,16 @@ def test_masses_range_from_empty_to_full():
     body = task.target_object._bodies[5]
     assert body.mass == pytest.approx(mass[5].item())
     task.close()
+
+
+def test_a_jug_stands_still_when_its_contacts_are_made_anew():
+    task = tasks.make_task("DoraJug-v1", 6)
+    task.reset(seed=0)
+    for _ in range(9):
+        task.step(task.scripted_action())
+    stood = task.snapshot.object_p
+    task.set_state_dict(task.get_state_dict())
+    for _ in range(6):
+        task.step(task.scripted_action())
+        assert (task.snapshot.object_p - stood).abs().max() < 2e-4
+    task.close()

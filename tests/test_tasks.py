@@ -121,8 +121,8 @@ def test_state_round_trip_restores_stage_observation_and_future(batch: DoraEnv):
     assert torch.equal(batch.machine.index, state["machine"]["stage"])
     torch.testing.assert_close(batch.get_obs(batch.get_info()), seen, atol=5e-3, rtol=0.02)
     batch.step(batch.scripted_action())
-    # PhysX forgets contacts, so an object with a wide foot settles anew after a restoration.
-    torch.testing.assert_close(batch.snapshot.object_p, after.object_p, atol=1.5e-3, rtol=0)
+    # PhysX forgets contacts, so what touches settles anew after a restoration.
+    torch.testing.assert_close(batch.snapshot.object_p, after.object_p, atol=5e-4, rtol=0)
     torch.testing.assert_close(batch.snapshot.hand_q, after.hand_q, atol=4e-3, rtol=0)
 
 

@@ -16,6 +16,7 @@ from dora.agents.env import TaskEnv, TaskFactory
 from dora.agents.evaluate import Act, Evaluation, no_correction, run_batch
 from dora.agents.learner import make_learner
 from dora.agents.networks import Policy
+from dora.errors import InputError
 
 POLL_SECONDS = 0.2
 """Time between two looks for Ctrl-C while helpers finish [s]."""
@@ -61,7 +62,8 @@ class Evaluators:
             check: called every control step; what it raises ends the evaluation, and the helpers.
 
         Raises:
-            RuntimeError: if a helper failed, with its reason.
+            InputError: if a task raised one, here or in a helper.
+            RuntimeError: if a helper failed otherwise, with its reason.
         """
         starts = range(0, episodes, self.env.batch_size[0])
         while len(self._helpers) < min(self._most, len(starts) - 1):
@@ -103,7 +105,12 @@ def _tables(env: TaskEnv, act: Act, starts: range, first_seed: int, check: Calla
 
 
 class _Helper:
-    """A process with tasks of its own."""
+    """A process with tasks of its own.
+
+    Args:
+        make_task, config: as for `Evaluators`.
+        sizes: of observation and action.
+    """
 
     def __init__(self, make_task: TaskFactory, config: RunConfig, sizes: tuple[int, int]):
         context = multiprocessing.get_context("spawn")
@@ -114,19 +121,29 @@ class _Helper:
         theirs.close()
 
     def begin(self, weights: Weights | None, starts: range, first_seed: int) -> None:
+        """Ask for the batches whose first episodes are `starts`, with these weights; None for no correction."""
         self._pipe.send((weights, starts, first_seed))
 
     def finish(self, check: Callable[[], None]) -> Tables:
+        """Wait for what `begin` asked for, calling `check` now and then.
+
+        Raises:
+            InputError: with the message of the process, if it raised one.
+            RuntimeError: if the process failed otherwise or ended, with its reason.
+        """
         while not self._pipe.poll(POLL_SECONDS):
             check()
-            if not self._process.is_alive() and not self._pipe.poll():
-                raise RuntimeError(f"a process that evaluates ended with status {self._process.exitcode}")
-        answer = self._pipe.recv()
-        if isinstance(answer, str):
-            raise RuntimeError(f"a process that evaluates failed: {answer}")
+        try:
+            answer = self._pipe.recv()
+        except EOFError:
+            self._process.join(END_SECONDS)
+            raise RuntimeError(f"a process that evaluates ended with status {self._process.exitcode}") from None
+        if isinstance(answer, Exception):
+            raise answer
         return answer
 
     def end(self) -> None:
+        """End the process, whatever it is doing."""
         self._pipe.close()
         self._process.terminate()
         self._process.join(END_SECONDS)
@@ -159,5 +176,7 @@ def _serve(pipe: Connection, make_task: TaskFactory, config: RunConfig, sizes: t
                 policy.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
                 act = policy.greedy
             pipe.send(_tables(env, act, starts, first_seed, check))
-        except Exception as error:  # told to the process that asked
-            pipe.send(f"{type(error).__name__}: {error}")
+        except InputError as error:
+            pipe.send(error)
+        except Exception as error:
+            pipe.send(RuntimeError(f"a process that evaluates failed: {type(error).__name__}: {error}"))

@@ -193,6 +193,11 @@ class Policy(TensorDictModuleBase):
         return fresh
 
     @property
+    def modules_by_name(self) -> dict[str, nn.Module]:
+        """What it takes to act, under the names that checkpoints give."""
+        return {"normaliser": self.normaliser, "actor": self.actor}
+
+    @property
     def action_size(self) -> int:
         """Number of action components."""
         if isinstance(self.actor, GaussianActor):

@@ -33,8 +33,7 @@ def load_policy(checkpoint: Checkpoint, path: Path) -> Policy:
         InputError: if its tensors do not fit its settings.
     """
     policy = make_learner(checkpoint.config, *checkpoint.sizes).policy
-    modules = {"normaliser": policy.normaliser, "actor": policy.actor}
-    unpack_modules(modules, checkpoint.tensors, path)
+    unpack_modules(policy.modules_by_name, checkpoint.tensors, path)
     return policy
 
 

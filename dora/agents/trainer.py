@@ -225,19 +225,23 @@ class Trainer:
         )
         if counters.best is None or [success, mean_return] > counters.best:
             counters.best = [success, mean_return]
-            self._checkpoint(pack_modules(self.learner.modules)).write(self.folder.best)
+            self._keep_as_best()
         reached = config.stop_success is not None and success >= config.stop_success
         counters.reached = counters.reached + 1 if reached else 0
         return counters.reached >= 2
+
+    def _keep_as_best(self) -> None:
+        """Write what it takes to act, without critics."""
+        self._checkpoint(pack_modules(self.learner.policy.modules_by_name)).write(self.folder.best)
 
     def _final_evaluation(self, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
         """Evaluate the best policy, and no correction, on seeds that chose nothing."""
         start = time.perf_counter()
         if self.folder.best.exists():
             best = read_checkpoint(self.folder.best)
-            unpack_modules(self.learner.modules, best.tensors, self.folder.best)
+            unpack_modules(self.learner.policy.modules_by_name, best.tensors, self.folder.best)
         else:
-            self._checkpoint(pack_modules(self.learner.modules)).write(self.folder.best)
+            self._keep_as_best()
         episodes = self.config.final_episodes
         evaluation = self._evaluators.run(self.learner.policy, episodes, FINAL_SEED, interrupt.check)
         zero = None

@@ -26,6 +26,7 @@ from dora.affordance.solids import (
     unite,
 )
 from dora.affordance.structure import AffordanceObject, Piece, assemble
+from dora.robot.shapes import Shape
 
 MASS = 0.30
 HEIGHT = 0.18
@@ -54,7 +55,11 @@ SECTIONS, RINGS, HANDLE_STEPS, HANDLE_POINTS = 48, 26, 48, 20
 HULL_SECTIONS = 24
 HULL_TOLERANCE = 0.0006
 """Largest distance of a slice's outline from the profile."""
-HULL_CUTS = (0.0, 0.112, 0.147, HEIGHT)
+FOOT_CLEARANCE = 0.0005
+"""Height of the lowest hull above the table: the jug stands on the corners of its foot."""
+FOOT_HALF = 0.0015
+"""Half height of the foot."""
+HULL_CUTS = (FOOT_CLEARANCE, 0.112, 0.147, HEIGHT)
 """Heights between which the filled body is taken for convex."""
 CAPSULE_TOLERANCE = 0.003
 """How coarsely the handle's centre line is divided into capsules, which are then fitted to it."""
@@ -80,7 +85,10 @@ def build() -> AffordanceObject:
         {"body": "BodyGrasp", "handle": "HandleGrasp", "rim": "RimGrasp"},
         target="handle",
         weights=[(mesh, MASS)],
-        pieces=[*(Piece("body", hull) for hull in _hulls()), *(Piece("handle", capsule) for capsule in capsules)],
+        pieces=[
+            *(Piece("body", shape) for shape in (*_hulls(), _foot())),
+            *(Piece("handle", capsule) for capsule in capsules),
+        ],
         solid=unite([filled, handle])[0],
     )
 
@@ -147,3 +155,15 @@ def _hulls() -> list[trimesh.Trimesh]:
         )
         hulls.append(trimesh.convex.convex_hull(_pulled(loft(points)).vertices))
     return hulls
+
+
+def _foot() -> Shape:
+    """A box with one corner below the handle, towards which the centre of mass is off the axis.
+
+    Of the many corners of a round foot PhysX keeps four contacts, now these and now those, some of them in the air: a
+    jug whose contacts are made anew would rock on the other ones.
+    """
+    half = (RADII[0][1] - FOOT_ROUNDING) / np.sqrt(2)
+    eighth = np.pi / 8  # half of the turn, as quaternions have it
+    return Shape("box", (0.0, 0.0, FOOT_HALF), (float(np.cos(eighth)), 0.0, 0.0, float(np.sin(eighth))),
+                 (float(half), float(half), FOOT_HALF))  # fmt: skip
