@@ -95,3 +95,15 @@ def test_an_interrupt_ends_the_helpers():
         evaluators.run(None, EPISODES, 0, interrupted)
     assert children() == 0
     evaluators.close()
+
+
+def test_a_helper_that_is_gone_is_reported():
+    evaluators = Evaluators(functools.partial(PointMass, CONFIG.eval_envs), CONFIG)
+    evaluators.run(None, EPISODES, 0)
+    [helper] = multiprocessing.active_children()
+    helper.kill()
+    helper.join()
+    with pytest.raises(RuntimeError, match="ended with status -9"):
+        evaluators.run(None, EPISODES, 0)
+    assert children() == 0
+    evaluators.close()

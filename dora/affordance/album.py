@@ -6,8 +6,8 @@ from pathlib import Path
 
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand import HandModel
-from dora.affordance.map import AffordanceMap
 from dora.affordance.pictures import caption, picture_contacts, picture_grasps
+from dora.affordance.prepared import map_of
 from dora.affordance.structure import AffordanceObject
 from dora.affordance.viewing import Surface
 from dora.errors import InputError
@@ -36,7 +36,7 @@ def write_album(
     except OSError as error:
         raise InputError(f"Cannot make the folder {folder} ({error.strerror}): choose another one.") from error
     paths = [folder / f"{obj.name}-{what}.png" for what in ("map", "grasps", "contacts")]
-    AffordanceMap.from_object(obj).picture(paths[0])
+    map_of(obj, "cpu").picture(paths[0])
     if candidates is None:
         return paths[:1]
     shown = candidates.select(chosen(candidates))

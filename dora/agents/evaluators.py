@@ -121,8 +121,15 @@ class _Helper:
         theirs.close()
 
     def begin(self, weights: Weights | None, starts: range, first_seed: int) -> None:
-        """Ask for the batches whose first episodes are `starts`, with these weights; None for no correction."""
-        self._pipe.send((weights, starts, first_seed))
+        """Ask for the batches whose first episodes are `starts`, with these weights; None for no correction.
+
+        Raises:
+            RuntimeError: if the process has ended.
+        """
+        try:
+            self._pipe.send((weights, starts, first_seed))
+        except BrokenPipeError:
+            raise self._ended() from None
 
     def finish(self, check: Callable[[], None]) -> Tables:
         """Wait for what `begin` asked for, calling `check` now and then.
@@ -136,11 +143,14 @@ class _Helper:
         try:
             answer = self._pipe.recv()
         except EOFError:
-            self._process.join(END_SECONDS)
-            raise RuntimeError(f"a process that evaluates ended with status {self._process.exitcode}") from None
+            raise self._ended() from None
         if isinstance(answer, Exception):
             raise answer
         return answer
+
+    def _ended(self) -> RuntimeError:
+        self._process.join(END_SECONDS)
+        return RuntimeError(f"a process that evaluates ended with status {self._process.exitcode}")
 
     def end(self) -> None:
         """End the process, whatever it is doing."""

@@ -16,8 +16,8 @@ from torch import Tensor
 from dora.affordance.agreement import Agreement, clearly_held
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.energies import Weights
-from dora.affordance.map import AffordanceMap
 from dora.affordance.optimise import Settings, optimise
+from dora.affordance.prepared import map_of
 from dora.affordance.protocol import STANDARD, Protocol
 from dora.affordance.structure import AffordanceObject
 from dora.affordance.voting import vote
@@ -180,7 +180,7 @@ def by_region(
 
 def votes(candidates: GraspCandidates, verdict: Validation, obj: AffordanceObject) -> dict[str, Int[Tensor, " c"]]:
     """Regions that the contacts vote for, at the candidate and after closing; -1 without contact."""
-    regions = AffordanceMap.from_object(obj)
+    regions = map_of(obj, "cpu")
     return {
         CANDIDATE: vote(regions, candidates.contacts.cpu(), candidates.contact_finger.cpu()),
         CLOSED: vote(regions, verdict.contacts, verdict.contact_finger),

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.map import AffordanceMap
+from dora.affordance.prepared import map_of
 from dora.affordance.protocol import DIRECTIONS, STANDARD, Protocol
 from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
@@ -279,6 +279,6 @@ def _label_force(grips: list[Grip | None], obj: AffordanceObject) -> Float[Tenso
         points = torch.tensor(np.concatenate([grip.point for _, grip in known]), dtype=torch.float32)
         force = torch.tensor(np.concatenate([grip.force for _, grip in known]), dtype=torch.float32)
         row = torch.tensor(np.repeat([row for row, _ in known], [len(grip.part) for _, grip in known]))
-        _, label = AffordanceMap.from_object(obj).nearest(points, 1)
+        _, label = map_of(obj, "cpu").nearest(points, 1)
         found.index_put_((row, label[:, 0]), force, accumulate=True)
     return found

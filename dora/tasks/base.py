@@ -15,7 +15,7 @@ from torch import Tensor
 from dora.errors import InputError
 from dora.robot.rotations import quaternion_from_rotation_vector
 from dora.sim.batch.actions import check_action
-from dora.tasks.building import BuiltEnv
+from dora.tasks.building import SCALE_DRAW, BuiltEnv
 from dora.tasks.choice import ERROR_DRAWS
 from dora.tasks.correction import Target, wrist_step
 from dora.tasks.options import FILTER
@@ -119,6 +119,7 @@ class DoraEnv(BuiltEnv):
         # One draw per environment from its own stream: neither num_envs nor the others' resets change it.
         parts = [self.DRAWS, 1, 1, ERROR_DRAWS, 1]
         size = sum(parts)
+        assert size < SCALE_DRAW
         draws = np.asarray(self._batched_episode_rng[env_idx.cpu().numpy()].uniform(size=(size,)))
         u = torch.as_tensor(draws, dtype=torch.float32, device=self.device).reshape(len(env_idx), size)
         place, mass, friction, error, key = u.split(parts, -1)

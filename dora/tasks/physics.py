@@ -9,20 +9,12 @@ import torch
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from dora.errors import InputError
+from dora.sim.rig import Physics
 from dora.tasks import check_task_id, make_task
 from dora.tasks.base import DoraEnv
 
 TUNNELLED = 0.010
 """Overlap at which a body is more inside another one than outside: about the radius of a finger or a handle [m]."""
-
-
-@dataclass(frozen=True)
-class Physics:
-    """Settings of the simulation: steps per second [Hz], contact offset [m], position iterations of the solver."""
-
-    frequency: int
-    contact_offset: float
-    iterations: int
 
 
 @dataclass(frozen=True)
@@ -51,12 +43,12 @@ def parse_physics(text: str) -> Physics:
     """Settings from `FREQUENCY:OFFSET:ITERATIONS`, in Hz, mm and a number; raises InputError."""
     try:
         frequency, offset, iterations = text.split(":")
-        physics = Physics(int(frequency), float(offset) / 1000, int(iterations))
+        numbers = float(int(frequency)), int(iterations), float(offset) / 1000
     except ValueError:
         raise InputError(f"{text!r} is not FREQUENCY:OFFSET_MM:ITERATIONS, such as 240:10:8") from None
-    if min(physics.frequency, physics.contact_offset, physics.iterations) <= 0:
+    if min(numbers) <= 0:
         raise InputError(f"{text!r} has a number that is not above zero")
-    return physics
+    return Physics(rate=numbers[0], position_iterations=numbers[1], contact_offset=numbers[2])
 
 
 def measure_physics(
@@ -71,24 +63,22 @@ def measure_physics(
 
     Args:
         env_id: a Dora id.
-        settings: what to compare; frequencies must be multiples of the task's control frequency.
+        settings: what to compare; rates must be multiples of the task's control frequency.
         starts: initial states, executed in one batch.
         preset: how much they are randomised.
         seed: of the initial states.
         progress: called with the settings done and their number.
 
     Raises:
-        InputError: for an unknown id or preset, no start, or a frequency that is no multiple of the control's.
+        InputError: for an unknown id or preset, no start, or a rate that is no multiple of the control's.
     """
     if starts < 1:
         raise InputError(f"physics is compared on at least one start, not {starts}")
     check_task_id(env_id)
     control = cast(type[DoraEnv], REGISTERED_ENVS[env_id].cls).CONTROL_FREQUENCY
     for physics in settings:
-        if physics.frequency % control:
-            raise InputError(
-                f"{physics.frequency} Hz is no multiple of the {control} Hz at which {env_id} is controlled"
-            )
+        if physics.rate % control:
+            raise InputError(f"{physics.rate:g} Hz is no multiple of the {control} Hz at which {env_id} is controlled")
     rows = []
     for physics in settings:
         progress(len(rows), len(settings))
@@ -98,8 +88,12 @@ def measure_physics(
 
 
 def _executed(env_id: str, physics: Physics, starts: int, preset: str, seed: int) -> PhysicsRow:
-    scene = {"contact_offset": physics.contact_offset, "solver_position_iterations": physics.iterations}
-    config = {"sim_freq": physics.frequency, "scene_config": scene}
+    scene = {
+        "contact_offset": physics.contact_offset,
+        "solver_position_iterations": physics.position_iterations,
+        "solver_velocity_iterations": physics.velocity_iterations,
+    }
+    config = {"sim_freq": int(physics.rate), "scene_config": scene}
     task = make_task(env_id, starts, preset=preset, sim_config=config)
     try:
         task.reset(seed=seed)
