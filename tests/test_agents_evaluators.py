@@ -5,6 +5,7 @@ import functools
 import multiprocessing
 import os
 from collections.abc import Callable
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 import pytest
@@ -13,7 +14,7 @@ from fake_task import PointMass
 from torch import Tensor
 
 from dora.agents.config import PPOConfig, RunConfig
-from dora.agents.evaluators import Evaluators
+from dora.agents.evaluators import HELPER, Evaluators
 from dora.agents.learner import make_learner
 from dora.errors import InputError
 
@@ -43,13 +44,12 @@ class FailsElsewhere(PointMass):
         return super().step(action)
 
 
-def children() -> int:
-    """Processes that this one has started and that have not ended."""
-    return len(multiprocessing.active_children())
+def helpers() -> list[BaseProcess]:
+    """Helper processes of this one that have not ended."""
+    return [process for process in multiprocessing.active_children() if process.name == HELPER]
 
 
 def test_processes_give_the_rows_of_one_process():
-    before = children()
     alone, shared = (
         Evaluators(functools.partial(PointMass, CONFIG.eval_envs), dataclasses.replace(CONFIG, workers=workers))
         for workers in (1, 2)
@@ -63,10 +63,10 @@ def test_processes_give_the_rows_of_one_process():
     policy.normaliser.shift.add_(1.0)  # another policy, whose weights have to arrive
     one, two = (evaluators.run(policy, EPISODES, 100) for evaluators in (alone, shared))
     assert torch.equal(one.table, two.table)
-    assert children() == before + 1
+    assert len(helpers()) == 1
     alone.close()
     shared.close()
-    assert children() == before
+    assert not helpers()
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_a_failing_helper_is_reported_and_ended(failure: str, error: type[Except
     evaluators = Evaluators(make, CONFIG)
     with pytest.raises(error, match=message):
         evaluators.run(None, EPISODES, 0)
-    assert children() == 0
+    assert not helpers()
     evaluators.close()
 
 
@@ -93,17 +93,17 @@ def test_an_interrupt_ends_the_helpers():
     evaluators = Evaluators(functools.partial(PointMass, CONFIG.eval_envs), CONFIG)
     with pytest.raises(KeyboardInterrupt):
         evaluators.run(None, EPISODES, 0, interrupted)
-    assert children() == 0
+    assert not helpers()
     evaluators.close()
 
 
 def test_a_helper_that_is_gone_is_reported():
     evaluators = Evaluators(functools.partial(PointMass, CONFIG.eval_envs), CONFIG)
     evaluators.run(None, EPISODES, 0)
-    [helper] = multiprocessing.active_children()
+    [helper] = helpers()
     helper.kill()
     helper.join()
     with pytest.raises(RuntimeError, match="ended with status -9"):
         evaluators.run(None, EPISODES, 0)
-    assert children() == 0
+    assert not helpers()
     evaluators.close()

@@ -23,6 +23,9 @@ POLL_SECONDS = 0.2
 END_SECONDS = 5.0
 """Helpers that have not ended by then are killed [s]."""
 
+HELPER = "dora-evaluator"
+"""Name of helper processes."""
+
 Weights = dict[str, np.ndarray]
 """A policy's parameters and buffers; torch would send tensors as shared files."""
 Tables = dict[int, np.ndarray]
@@ -115,7 +118,8 @@ class _Helper:
     def __init__(self, make_task: TaskFactory, config: RunConfig, sizes: tuple[int, int]):
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, make_task, config, sizes), daemon=True)
+        arguments = (theirs, make_task, config, sizes)
+        self._process = context.Process(target=_serve, args=arguments, name=HELPER, daemon=True)
         with sigint_blocked():
             self._process.start()
         theirs.close()
