@@ -37,7 +37,7 @@ class Args:
     env: str | None = None
     """Task id, for example DoraCube-v1."""
     agent: Literal["ppo", "sac", "mappo", "happo"] | None = None
-    """Learner (default ppo)."""
+    """Learner (default: the one recommended for the task, docs/agents.md)."""
     guidance: Literal["affordance", "none"] | None = None
     """Use affordance maps and grasp candidates, or nothing of them (default affordance)."""
     guidance_parts: tuple[Literal["observation", "reward", "filter", "prior"], ...] | None = None
@@ -84,7 +84,7 @@ def settings(args: Args) -> RunConfig:
         raise InputError("No task is given: add --env, for example --env DoraCube-v1.")
     return recommended(
         args.env,
-        args.agent or "ppo",
+        args.agent,
         guidance=args.guidance,
         seed=args.seed,
         total_steps=args.total_steps,

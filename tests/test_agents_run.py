@@ -6,7 +6,8 @@ from types import ModuleType
 import pytest
 from commands import call, load_command
 
-from dora.agents.presets import recommended
+from dora.agents.config import LEARNER_CONFIGS
+from dora.agents.presets import DEFAULT_AGENT, PRESETS, RECOMMENDED_AGENT, recommended
 from dora.agents.runfolder import RunFolder
 
 
@@ -59,3 +60,13 @@ def test_resume_refuses_another_task(
     RunFolder(tmp_path).create(recommended("DoraCube-v1", "ppo"))
     assert call(script, monkeypatch, "--resume", str(tmp_path), "--env", "DoraJug-v1") == 2
     assert "has env DoraCube-v1, not DoraJug-v1" in capsys.readouterr().err
+
+
+def test_a_bare_command_takes_the_learner_recommended_for_the_task():
+    chosen = {env: recommended(env) for env in (*RECOMMENDED_AGENT, "DoraCube-v1", "PickCube-v1")}
+    for env, config in chosen.items():
+        assert config.agent == RECOMMENDED_AGENT.get(env, DEFAULT_AGENT)
+        assert isinstance(config.learner, LEARNER_CONFIGS[config.agent])
+    for env, agent in RECOMMENDED_AGENT.items():
+        assert chosen[env].total_steps == PRESETS[env, agent]["total_steps"]
+        assert recommended(env, "ppo").agent == "ppo"

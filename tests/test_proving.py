@@ -25,7 +25,7 @@ def test_a_proof_tells_a_good_grasp_from_one_in_the_air():
 
 
 def test_every_reachable_candidate_is_tried_equally_often_and_no_other():
-    pick = _Balanced(4, torch.Generator().manual_seed(0))
+    pick = _Balanced(4, first=1)
     reachable = torch.tensor([[True, True, False, False]] * 6 + [[True, True, True, False]] * 6)
     only = pick(reachable)
     assert (only.sum(-1) == 1).all()
@@ -33,10 +33,11 @@ def test_every_reachable_candidate_is_tried_equally_often_and_no_other():
     assert pick.tries[3] == 0
     assert pick.tries[:3].sum() == 12
     assert pick.tries[:3].max() - pick.tries[:3].min() <= 1
+    assert pick.led[:3].tolist() == [1, 0, 1]
 
 
 def test_a_start_without_any_candidate_is_no_try():
-    pick = _Balanced(2, torch.Generator().manual_seed(0))
+    pick = _Balanced(2)
     only = pick(torch.zeros(3, 2, dtype=torch.bool))
     assert not only.any()
     assert not pick.possible.any()
@@ -49,7 +50,7 @@ def test_among_equals_the_one_reached_more_often_is_first():
     torch.testing.assert_close(best_first.position, two.position[[1, 0]])
 
 
-@pytest.mark.parametrize("env_id", TASKS.values())
+@pytest.mark.parametrize("env_id", [TASKS["cube"], TASKS["jug"]])
 def test_the_table_of_reachable_candidates_comes_along(env_id: str):
     task = make_task(env_id, 1)
     table = task.reach_table

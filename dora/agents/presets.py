@@ -7,6 +7,10 @@ from typing import Any
 from dora.agents.config import GUIDANCES, LEARNER_CONFIGS, SINGLE_ARM_AGENTS, RunConfig
 from dora.errors import InputError
 
+DEFAULT_AGENT = "ppo"
+RECOMMENDED_AGENT: dict[str, str] = {"DoraJug-v1": "sac", "DoraHammer-v1": "sac"}
+"""The learner of a bare command, where it is not `DEFAULT_AGENT`."""
+
 PRESETS: dict[tuple[str, str], dict[str, Any]] = {
     ("DoraCube-v1", "ppo"): {
         "total_steps": 300_000,
@@ -35,6 +39,22 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
         "eval_envs": 50,
         "learner": {"rollout": 32, "log_std": -1.8},
     },
+    ("DoraJug-v1", "sac"): {
+        "total_steps": 300_000,
+        "stop_success": 0.98,
+        "num_envs": 32,
+        "eval_every": 25_000,
+        "eval_episodes": 100,
+        "eval_envs": 50,
+    },
+    ("DoraHammer-v1", "sac"): {
+        "total_steps": 200_000,
+        "stop_success": 0.97,
+        "num_envs": 32,
+        "eval_every": 50_000,
+        "eval_episodes": 100,
+        "eval_envs": 50,
+    },
     ("DoraCube-v1", "sac"): {
         "total_steps": 200_000,
         "stop_success": 0.99,
@@ -52,17 +72,18 @@ WITHOUT_PRIOR: dict[str, dict[str, Any]] = {"sac": {"prior": 0.0}}
 POSITIVE = ("total_steps", "num_envs", "eval_every", "eval_episodes", "final_episodes", "eval_envs")
 
 
-def recommended(env: str, agent: str, **overrides: Any) -> RunConfig:
+def recommended(env: str, agent: str | None = None, **overrides: Any) -> RunConfig:
     """Settings of a run: the defaults, the preset of (env, agent), then `overrides` that are not None.
 
     Args:
         env: task id; one without a preset gets the defaults.
-        agent: learner.
+        agent: learner; the one recommended for the task if None.
         overrides: fields of `RunConfig`; `learner` is a dict of fields of the learner's settings.
 
     Raises:
         InputError: if a value makes no sense.
     """
+    agent = agent or RECOMMENDED_AGENT.get(env, DEFAULT_AGENT)
     if agent not in SINGLE_ARM_AGENTS:
         raise InputError(f"The learner {agent} needs a task with two arms and {env} has one: use --agent ppo or sac.")
     preset = dict(PRESETS.get((env, agent), {}))

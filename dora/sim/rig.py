@@ -14,7 +14,7 @@ from dora.errors import InputError
 from dora.robot import RobotDescription
 from dora.sim.grip import GripReader
 from dora.sim.hand import FloatingHand
-from dora.sim.objects import CONTACT_OFFSET, object_entity
+from dora.sim.objects import object_entity
 
 TABLE_HALF = (1.0, 1.0, 0.05)
 """Half extents of the table [m]; its upper face is z = 0."""
@@ -37,7 +37,7 @@ class Physics:
     rate: float = 200.0
     position_iterations: int = 8
     velocity_iterations: int = 1
-    contact_offset: float = CONTACT_OFFSET
+    contact_offset: float = 0.001
 
     def __post_init__(self) -> None:
         if not (self.rate > 0 and self.position_iterations > 0 and self.velocity_iterations >= 0):

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dora.affordance.approach import free_approaches
@@ -29,7 +29,7 @@ from dora.sim.validation import validate
 
 ROUND = 192
 """Candidates searched at a time for the target region."""
-MOST_ROUNDS = 12
+MOST_ROUNDS = 20
 """Rounds after which a region has to have enough."""
 POOL = 240
 """Grasps of the target region that are ranked."""
@@ -49,18 +49,24 @@ OTHERS_KEPT = 32
 """The best of them that are shipped."""
 
 
-def ship(name: str, seed: int, phases: PhaseProgress) -> Path:
+Usable = Callable[[GraspCandidates], Bool[Tensor, " c"]]
+"""Tells which grasps a task can use."""
+
+
+def ship(name: str, seed: int, phases: PhaseProgress, usable: Usable | None = None) -> Path:
     """Make and write the shipped set of an object; returns its file.
 
     Args:
         name: one of our objects.
         seed: of all random draws.
         phases: where progress is shown.
+        usable: what the object's task can use; the best grasps of the target region are chosen among those, and some
+            of the others follow.
 
     Raises:
         InputError: unknown object, or too few valid grasps.
     """
-    maker = SetMaker(load_object(name), load_robot(ROBOT), phases)
+    maker = SetMaker(load_object(name), load_robot(ROBOT), phases, usable)
     path = shipped_path(name)
     path.parent.mkdir(exist_ok=True)
     maker.make(seed).save(path)
@@ -68,10 +74,12 @@ def ship(name: str, seed: int, phases: PhaseProgress) -> Path:
 
 
 class SetMaker:
-    """Makes the shipped set of one object for one robot."""
+    """Makes the shipped set of one object for one robot; `usable` as of `ship`."""
 
-    def __init__(self, obj: AffordanceObject, robot: RobotDescription, phases: PhaseProgress) -> None:
-        self.obj, self.robot, self.phases = obj, robot, phases
+    def __init__(
+        self, obj: AffordanceObject, robot: RobotDescription, phases: PhaseProgress, usable: Usable | None = None
+    ) -> None:
+        self.obj, self.robot, self.phases, self.usable = obj, robot, phases, usable
         self.reach = Reach(robot, obj, start=STARTS.get(obj.name, "home"))
         self.on_table = obj.name not in OFF_TABLE
 
@@ -79,7 +87,7 @@ class SetMaker:
         """The best grasps of the target region, then those of the others; InputError if there are too few."""
         parts = [self.ranked(self.pool(seed)).select(slice(KEPT))]
         for index, label in enumerate(self.obj.labels):
-            if label != self.obj.target:
+            if label != self.obj.target or self.usable is not None:
                 found = self.valid(OTHERS, seed + MOST_ROUNDS + index, label)
                 parts += [] if found is None else [self.ranked(found).select(slice(OTHERS_KEPT))]
         made = {"search": repr(Settings()), "protocol": repr(STANDARD), "ranking": repr(Execution()), "seed": seed}
@@ -89,7 +97,7 @@ class SetMaker:
         """`POOL` valid grasps of the target region, or as many as there are."""
         sets: list[GraspCandidates] = []
         for index in range(MOST_ROUNDS):
-            found = self.valid(ROUND, seed + index, self.obj.target)
+            found = self.valid(ROUND, seed + index, self.obj.target, self.usable)
             sets += [] if found is None else [found]
             if sum(map(len, sets)) >= POOL:
                 break
@@ -99,13 +107,15 @@ class SetMaker:
             raise InputError(f"{name}: only {count} grasps of {target!r} are valid, and {FEWEST} are needed.")
         return concatenate(sets).select(slice(POOL))
 
-    def valid(self, num: int, seed: int, label: str) -> GraspCandidates | None:
-        """Those of `num` candidates that hold `label`, are free on an approach and strictly valid; None if none is."""
+    def valid(self, num: int, seed: int, label: str, usable: Usable | None = None) -> GraspCandidates | None:
+        """Those of `num` candidates that hold `label`, are usable, free on an approach and strictly valid; None if
+        none is."""
         found = optimise(
             self.obj, self.robot, num, seed, label, progress=self.phase(f"search {label}", 1 / Settings().iterations)
         )
         name = self.obj.classes[self.obj.label_index(label)]
         good = found.valid & (found.self_penetration < STANDARD.strict_self_penetration) & found.of_class(name)
+        good = good if usable is None else good & usable(found)
         if not good.any():
             return None
         found, free = free_approaches(found.select(good), self.reach)

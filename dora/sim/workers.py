@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_all_start_methods, get_context
+from multiprocessing import forkserver, get_all_start_methods, get_context
 from typing import Any, TypeVar
 
 import torch
@@ -15,7 +15,7 @@ Progress = Callable[[int, int], None]
 """Called now and then with the number of cases done and of all cases."""
 
 CHUNK = 4
-"""Cases that a process takes at once."""
+"""Cases that a process takes at once, where they are short."""
 PRELOADED = ["dora.sim.validation", "dora.sim.ranking"]
 """Modules that are imported once for all processes, where the system can fork them from a clean server."""
 
@@ -31,6 +31,7 @@ def run_cases(
     cases: Sequence[Case],
     processes: int | None = None,
     progress: Progress | None = None,
+    chunk: int = CHUNK,
 ) -> list[Result]:
     """Results of all cases, in their order.
 
@@ -40,12 +41,13 @@ def run_cases(
         cases: what the task is called with, one after the other.
         processes: number of processes; one per core by default. With 1 everything runs in this process.
         progress: told about cases that are done.
+        chunk: cases that a process takes at once.
 
     Raises:
         RuntimeError: a process died (a crash in native code, or too little memory).
         Exception: whatever the task raised first; nothing goes on running then.
     """
-    count = min(processes or available_cores(), -(-len(cases) // CHUNK))
+    count = min(processes or available_cores(), -(-len(cases) // chunk))
     report = progress or (lambda done, total: None)
     if count <= 1:
         task, results = factory(*arguments), []
@@ -53,10 +55,10 @@ def run_cases(
             results.append(task(case))
             report(len(results), len(cases))
         return results
-    chunks = [range(start, min(start + CHUNK, len(cases))) for start in range(0, len(cases), CHUNK)]
+    chunks = [range(start, min(start + chunk, len(cases))) for start in range(0, len(cases), chunk)]
     found: dict[int, Result] = {}
     with ProcessPoolExecutor(count, _context(), _remember, (factory, arguments)) as pool:
-        pending = {pool.submit(_work, [cases[i] for i in chunk]): chunk for chunk in chunks}
+        pending = {pool.submit(_work, [cases[i] for i in part]): part for part in chunks}
         try:
             for future in as_completed(pending):
                 found.update(zip(pending[future], future.result(), strict=True))
@@ -66,6 +68,13 @@ def run_cases(
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
     return [found[i] for i in range(len(cases))]
+
+
+def prepare() -> None:
+    """Begin to import, beside other work, what the processes of `run_cases` will need; returns at once."""
+    if "forkserver" in get_all_start_methods() and available_cores() > 1:
+        _context()
+        forkserver.ensure_running()
 
 
 def _context() -> Any:

@@ -88,6 +88,10 @@ class BuiltEnv(JudgedEnv):
     def candidates(self) -> GraspCandidates:
         """Grasps of the task's object."""
 
+    def prepared(self, candidates: GraspCandidates) -> GraspCandidates:
+        """The same grasps as this task executes them."""
+        return candidates
+
     def make_reference(self) -> Reference:
         """What leads the hand along the chosen candidate; called once per scene."""
         return GraspReference(self.num_envs, self.device)
@@ -169,7 +173,7 @@ class BuiltEnv(JudgedEnv):
         self._reader = SimulatorReader(self.scene, self.agent, *bodies, points, self.CONTACT_EVERY_STEP)
         self._properties = ObjectProperties(self.target_object)
         self._load_judgement()
-        choice = Choice(self._grasps or self.candidates(), self.num_envs, self.device)
+        choice = Choice(self.prepared(self._grasps or self.candidates()), self.num_envs, self.device)
         correction = Correction(*size, self.BOUNDS, self.device)
         self.guide = Guide(self.parts, choice, self.make_reference(), correction)
         self.guide.anneal(**self._shares)

@@ -20,6 +20,7 @@ from dora.robot.rotations import (
     rotation_angle,
     rotation_vector_from_quaternion,
 )
+from dora.tasks.catchable import REACH, TURN
 from dora.tasks.correction import Target
 from dora.tasks.hammer_snapshot import HammerSnapshot
 from dora.tasks.hammering import Pose, Strike, arrival, blend, compose, fallen, inverse, relative, slew, slid
@@ -47,10 +48,6 @@ CLOSE_TIME = 0.35
 """From the command to close until the hand counts as closed [s]."""
 SETTLE_TIME = 0.35
 """How long the closed hand keeps still, while the hammer's pose in it is measured [s]."""
-REACH = (0.16, 0.16, 0.0)
-"""Half extents of the box around the start in which the wrist waits for the hammer [m]."""
-TURN = 0.6
-"""Largest turn from the start's orientation while waiting [rad]."""
 MEMORY = 0.3
 """Share of a new measurement of the hammer's pose in the hand."""
 GAP = 0.05
@@ -127,7 +124,7 @@ class CatchReference(Reference):
     def __init__(self, num_envs: int, strike: Strike, dt: float, device: torch.device):
         super().__init__(num_envs, device)
         self.strike, self.dt = strike, dt
-        self._reach = torch.tensor(REACH, device=device)
+        self._reach = torch.tensor([*REACH, 0.0], device=device)
 
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(num_envs, *shape, device=device)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import sapien
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.registration import register_env
@@ -15,14 +15,15 @@ from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.objects import load_object
+from dora.affordance.shipped import best_candidates
 from dora.robot.rotations import (
-    quaternion_from_matrix,
     quaternion_from_rotation_vector,
     quaternion_multiply,
     rotation_angle,
 )
 from dora.sim.objects import build_object
 from dora.tasks.base import DoraEnv
+from dora.tasks.catchable import with_waiting_hand, within_reach
 from dora.tasks.catching import CatchReference
 from dora.tasks.hammer_judging import DEEPEST, PAPER_TERMS, STAGES, TERMS
 from dora.tasks.hammer_snapshot import (
@@ -65,36 +66,12 @@ FALLEN = 0.15
 UNKNOWN = 1e3
 """In-hand motion before the window is full [m]."""
 
-# One power grasp around the handle, found by a cross-entropy search over catches, until the optimiser's candidates
-# replace it: where the hand holds the handle, the axes of the hand in the hammer frame, and finger postures (proximal
-# and medial joints of the four fingers, then those of the thumb).
-HELD_AT = (-0.0028, 0.0, -0.12)
-"""Point of the handle's axis in the middle of the hand [m], hammer frame."""
-HELD_IN = (0.043, 0.0, 0.115)
-"""The same point in the hand frame [m]."""
-OPEN = (0.521, 0.537, 0.146, 0.237)
-CLOSED = (1.350, 1.025, 0.915, 0.747)
-"""[rad]"""
-THUMB_ABDUCTION = 0.119
-"""[rad]"""
-HAND_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-"""Rows of the rotation from the hand to the hammer: fingers along the strike, thumb towards the head."""
-
-
-def _posture(fingers: tuple[float, float, float, float]) -> Tensor:
-    proximal, medial, thumb_proximal, thumb_medial = fingers
-    thumb = [THUMB_ABDUCTION, thumb_proximal, thumb_medial, thumb_medial]
-    return torch.tensor(thumb + [0.0, proximal, medial, medial] * 4)[None]
-
-
-def hand_made_candidates() -> GraspCandidates:
-    """One grasp with the palm on the handle's side, so that the fingers point in the direction of the strike."""
-    axes = torch.tensor(HAND_AXES)
-    position = torch.tensor(HELD_AT) - axes @ torch.tensor(HELD_IN)
-    return GraspCandidates(
-        "hammer", position[None], quaternion_from_matrix(axes)[None], axes[None, :, 0],
-        _posture(OPEN), _posture(CLOSED), ("HandleGrasp",),
-    )  # fmt: skip
+CLASS = "HandleGrasp"
+"""The grasp class that the task asks for."""
+MOST = 24
+"""Stored candidates that the task works with."""
+FEWEST_CATCHES = 0.5
+"""Share of executed episodes that a ranked candidate must have survived to be one of them."""
 
 
 def _nail_axis(s: HammerSnapshot) -> Tensor:
@@ -174,7 +151,15 @@ class HammerEnv(DoraEnv):
             self.agent.wrist_controller.set_motion(self.WRIST_SPEED, self.WRIST_SPIN, feed_forward=True)
 
     def candidates(self) -> GraspCandidates:
-        return hand_made_candidates()
+        return best_candidates("hammer", CLASS, FEWEST_CATCHES, MOST)
+
+    def prepared(self, candidates: GraspCandidates) -> GraspCandidates:
+        """The hand waits wide open, in the posture in which the arm starts."""
+        return with_waiting_hand(candidates, self.agent.description, self.HOME)
+
+    def reachable(self, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]) -> Bool[Tensor, "b c"]:
+        """f_reach: which candidates the hand can wait with below a hammer that is released like this."""
+        return within_reach(self.guide.choice.candidates, object_p, object_q, *self._home)
 
     def make_reference(self) -> Reference:
         points = torch.tensor(NAIL_TOP, device=self.device), self._points["face"]

@@ -15,11 +15,13 @@ from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates, concatenate
 from dora.affordance.objects import load_object
+from dora.affordance.optimise import OFF_TABLE
 from dora.affordance.shipped import data_folder, load_candidates, shipped_path
+from dora.sim.workers import run_cases
 from dora.tasks import make_task
 from dora.tasks.base import DoraEnv
 
-TASKS = {"cube": "DoraCube-v1", "jug": "DoraJug-v1"}
+TASKS = {"cube": "DoraCube-v1", "jug": "DoraJug-v1", "hammer": "DoraHammer-v1"}
 """The task in which the grasps of an object are executed."""
 FIRST_TRIES, MORE_TRIES = 6, 30
 """Episodes per grasp of a proof that makes a shipped set: of all grasps, then of the better ones."""
@@ -29,6 +31,8 @@ BATCH = 64
 """Episodes that run together."""
 CLEAN = 2 / 3
 """Share of the task's penetration limit within which an execution counts: what barely passes will not do so again."""
+STARTS, USABLE = 64, 0.5
+"""Starts from which a grasp is asked to be within reach, and from which share of them."""
 SEED = 10_000
 """First seed; far from those of training and evaluation, so that scores are not made on their starts."""
 
@@ -47,26 +51,39 @@ class Proof:
 
 
 class _Balanced:
-    """Gives every new episode the reachable candidate that has been tried least."""
+    """Gives every new episode the reachable candidate that has been tried least; among equals, in turn from `first`."""
 
-    def __init__(self, count: int, generator: torch.Generator):
+    def __init__(self, count: int, first: int = 0):
         self.tries = torch.zeros(count, dtype=torch.long)
-        self.generator = generator
+        self.turn = ((torch.arange(count) - first) % count) / count
         self.led = torch.empty(0, dtype=torch.long)
         self.possible = torch.empty(0, dtype=torch.bool)
 
     def __call__(self, reachable: Bool[Tensor, "b c"]) -> Bool[Tensor, "b c"]:
         able = reachable.cpu()
-        chance = torch.rand(able.shape, generator=self.generator)
         chosen = []
-        for row, luck in zip(able, chance, strict=True):
-            best = int(torch.where(row, self.tries + luck, torch.inf).argmin())
+        for row in able:
+            best = int(torch.where(row, self.tries + self.turn, torch.inf).argmin())
             self.tries[best] += int(row[best])
             chosen.append(best)
         self.led, self.possible = torch.tensor(chosen), able.any(-1)
         only = torch.zeros_like(able)
         only[torch.arange(len(able)), self.led] = True
         return only.to(reachable.device) & reachable
+
+
+class _Executor:
+    """Executes batches of episodes of a task with candidates, one batch after the other."""
+
+    def __init__(self, env_id: str, preset: str, candidates: GraspCandidates):
+        self.task, self.count = make_task(env_id, BATCH, preset=preset, grasps=candidates), len(candidates)
+
+    def __call__(self, case: tuple[int, int]) -> tuple[Int[Tensor, " c"], Int[Tensor, " c"]]:
+        """How often each candidate led, and how often with success, in a batch of (index, seed)."""
+        index, seed = case
+        self.task.narrow = pick = _Balanced(self.count, index * BATCH)
+        won = _executed(self.task, seed).cpu() & pick.possible
+        return pick.tries, torch.bincount(pick.led[won], minlength=self.count)
 
 
 def prove(
@@ -76,6 +93,7 @@ def prove(
     preset: str = "standard",
     progress: Callable[[int, int], None] | None = None,
     seed: int = SEED,
+    processes: int | None = None,
 ) -> Proof:
     """Executes c candidates in a task, each about equally often, where f_reach lets them.
 
@@ -85,19 +103,18 @@ def prove(
         episodes: in all, rounded up to whole batches of 64.
         preset: how the episodes are randomised; with candidate error, so that fragile grasps fail.
         progress: is called with (episodes done, episodes).
-        seed: of starts and errors.
+        seed: of starts and errors; the result does not depend on `processes`.
+        processes: number of processes, one per core by default; 1 stays in this process.
     """
-    task = make_task(env_id, BATCH, preset=preset, grasps=candidates)
-    pick = _Balanced(len(candidates), torch.Generator().manual_seed(seed))
-    task.narrow = pick
-    wins, rounds = torch.zeros(len(candidates)), -(-episodes // BATCH)
-    for index in range(rounds):
-        success = _executed(task, seed + index)
-        wins.index_add_(0, pick.led, (success.cpu() & pick.possible).float())
+    cases = [(index, seed + index) for index in range(-(-episodes // BATCH))]
+
+    def report(done: int, total: int) -> None:
         if progress is not None:
-            progress((index + 1) * BATCH, rounds * BATCH)
-    task.close()
-    return Proof(pick.tries, wins / pick.tries.clamp(min=1))
+            progress(done * BATCH, total * BATCH)
+
+    found = run_cases(_Executor, (env_id, preset, candidates), cases, processes, report, chunk=1)
+    tries, wins = (torch.stack(counts).sum(0) for counts in zip(*found, strict=True))
+    return Proof(tries, wins / tries.clamp(min=1))
 
 
 def _executed(task: DoraEnv, seed: int) -> Bool[Tensor, " n"]:
@@ -115,6 +132,26 @@ def ranked(candidates: GraspCandidates, proof: Proof) -> GraspCandidates:
     """The candidates with the proof's scores, best first; among equals, those that were reached more often."""
     order = torch.argsort(proof.score + 1e-6 * proof.tries, descending=True, stable=True)
     return replace(candidates, score=proof.score).select(order)
+
+
+def usable_in_task(name: str) -> Callable[[GraspCandidates], Bool[Tensor, " c"]] | None:
+    """Which grasps of an object its task can use at all: those within reach from half of some starts.
+
+    None where there is no such task, or the object stands on a table, which the search for grasps takes care of.
+    """
+    if name not in TASKS or name not in OFF_TABLE:
+        return None
+    env_id = TASKS[name]
+
+    def usable(candidates: GraspCandidates) -> Bool[Tensor, " c"]:
+        task = make_task(env_id, STARTS, grasps=candidates)
+        task.reset(seed=SEED)
+        pose = task.target_object.pose
+        reached = task.reachable(pose.p, pose.q).float().mean(0) >= USABLE
+        task.close()
+        return reached.cpu()
+
+    return usable
 
 
 def prove_shipped(name: str, phase: Callable[[str], Callable[[int, int], None]]) -> Path:
