@@ -3,8 +3,8 @@
     python experiments/grasps.py --object jug --num 256 --validate sapien --out runs/jug.safetensors
     python experiments/grasps.py --mesh mug.glb --labels mug.yaml --units mm --region handle
 
-Prints a table with two baselines beside it (a search without E_DFC, and one iteration of it), and writes OUT
-(safetensors) and a .json beside it. `experiments/view.py OUT` shows the grasps.
+Prints a table with baselines beside it (searches without E_DFC, without closing the hand around the object, and of one
+iteration), and writes OUT (safetensors) and a .json beside it. `experiments/view.py OUT` shows the grasps.
 """
 
 import sys
@@ -23,7 +23,7 @@ from dora.robot import load_robot
 from dora.sim.grasp_report import check_out, print_report, write_report
 from dora.sim.grasps import baselines, by_region, generate, summary, voting_summary
 from dora.sim.shipping import ship
-from dora.tasks.proving import TASKS, prove_shipped
+from dora.tasks.proving import TASKS, prove_shipped, usable_in_task
 
 INTERRUPTED = 130  # exit status after Ctrl-C
 BAD_INPUT = 2  # exit status after input that a person can mend
@@ -124,7 +124,7 @@ def remake(args: Args) -> None:
         raise InputError(f"--prove needs --object, one of {', '.join(TASKS)}: no task proves {name!r}.")
     with PhaseProgress() as phases:
         if args.ship:
-            print(ship(name, args.seed, phases))
+            print(ship(name, args.seed, phases, usable_in_task(name)))
         if name in TASKS:
             print(prove_shipped(name, lambda title: phases.phase(title, "episodes")))
 

@@ -5,6 +5,7 @@
     python experiments/view.py mug.glb --labels mug.yaml            # the regions of your own mesh
     python experiments/view.py runs/grasps/mug.safetensors --mesh mug.glb --labels mug.yaml
     python experiments/view.py jug --pictures runs/pictures         # PNG files instead of a page
+    python experiments/view.py --pictures runs/pictures             # one PNG of all our objects
 
 Runs until Ctrl-C.
 """
@@ -17,7 +18,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from dora.affordance.album import write_album
+from dora.affordance.album import write_album, write_objects
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.importing import import_object
 from dora.affordance.objects import available_objects, load_object
@@ -35,8 +36,9 @@ GRASPS = ".safetensors"  # suffix of a file of grasps
 class Args:
     """Show an object, its regions and its grasps on a web page."""
 
-    source: tyro.conf.Positional[str]
-    """An object (cube, jug, hammer, microwave), a file of grasps (.safetensors) or a mesh file."""
+    source: tyro.conf.Positional[str | None] = None
+    """An object (cube, jug, hammer, microwave), a file of grasps (.safetensors) or a mesh file; none with --pictures:
+    all our objects."""
     port: int = 8080
     """TCP port of the page."""
     host: str = "127.0.0.1"
@@ -50,7 +52,8 @@ class Args:
     units: Literal["m", "cm", "mm", "in"] = "m"
     """Unit of length of --mesh; GLB files are in metres."""
     pictures: Path | None = None
-    """Folder: write PNGs of regions, of four grasps and of their contact semantic maps there, and serve no page."""
+    """Folder: write PNGs of regions, of four grasps and of their contact semantic maps there, or one of all our objects
+    (objects.png), and serve no page."""
     robot: str = "diana7_hit"
     """Robot whose hand is shown: a folder name in robots/ or a path."""
 
@@ -58,6 +61,8 @@ class Args:
 def content(args: Args) -> tuple[AffordanceObject, GraspCandidates | None]:
     """The object to show and its grasps, if there are any."""
     robot = load_robot(args.robot)
+    if args.source is None:
+        raise InputError("Say what to show: an object, a file of grasps or a mesh file, for example jug.")
     if args.source in available_objects():
         return load_object(args.source), load_candidates(args.source, robot)
     path = Path(args.source)
@@ -80,6 +85,9 @@ def main() -> int:
     """Serve the page until Ctrl-C; returns the exit status."""
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     try:
+        if args.source is None and args.pictures is not None:
+            print(write_objects(args.pictures))
+            return 0
         obj, candidates = content(args)
         if args.pictures is not None:
             print(*write_album(obj, candidates, load_robot(args.robot), args.pictures), sep="\n")

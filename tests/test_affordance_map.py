@@ -191,14 +191,15 @@ def test_map_moves_to_a_device(maps: dict[str, AffordanceMap]):
 def test_picture_shows_every_region(tmp_path, maps: dict[str, AffordanceMap]):
     path = tmp_path / "jug.png"
     maps["jug"].picture(path, size=160)
-    picture = imageio.imread(path)
-    assert picture.shape == (160, 480, 3)
+    picture = imageio.imread(path)[..., :3]
+    assert picture.shape[1] == 480
+    assert 160 < picture.shape[0] < 300  # titles and legend
     hue = picture.reshape(-1, 3).astype(float)
     hue /= np.maximum(hue.max(1, keepdims=True), 1)
     for color in PALETTE[:3]:
         wanted = np.array(color) / max(color)
-        assert (np.abs(hue - wanted).max(1) < 0.1).sum() > 100
-    with pytest.raises(InputError, match="cannot write"):
+        assert (np.abs(hue - wanted).max(1) < 0.1).sum() > 1500
+    with pytest.raises(InputError, match="Cannot write"):
         maps["jug"].picture(tmp_path / "nowhere" / "jug.png", size=40)
 
 

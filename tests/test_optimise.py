@@ -8,16 +8,17 @@ import torch
 import trimesh
 
 from dora.affordance.compiled import CompiledDescent, CompiledEnergy
-from dora.affordance.contact_map import wrist_matrix
+from dora.affordance.contact_map import pressed_contacts, wrist_matrix
 from dora.affordance.descent import Descent, Schedule
 from dora.affordance.energies import GraspEnergy, Weights
 from dora.affordance.hand import HandModel
+from dora.affordance.holding import hold
 from dora.affordance.importing import import_object
 from dora.affordance.initial import InitialPoses, Spread
 from dora.affordance.objects import load_object
 from dora.affordance.optimise import opened, optimise, table_of
 from dora.affordance.prepared import field_of, forget, hand_of
-from dora.affordance.protocol import STANDARD, pregrasp
+from dora.affordance.protocol import STANDARD, pregrasp, squeeze
 from dora.affordance.search import Search, Settings
 from dora.affordance.signed_distance import ExactDistance, SignedDistanceField
 from dora.errors import InputError
@@ -54,6 +55,22 @@ def test_candidates_are_complete(robot, cube):
         assert ((joints >= lower - 1e-6) & (joints <= upper + 1e-6)).all()
     assert torch.equal(cube.valid, cube.penetration <= STANDARD.penetration)
     assert set(cube.grasp_class) <= {"BodyGrasp", "NoContact"}
+
+
+def test_contacts_are_those_of_the_hand_closed_by_the_model(robot, cube):
+    """Other contacts than at the candidate's posture, and the parts of the hand that press in the model."""
+    hand, obj = HandModel(robot), load_object("cube")
+    field = SignedDistanceField(obj.solid)
+    wrist = wrist_matrix(cube.position, cube.quaternion)
+    postures = pregrasp(robot, cube.joints), squeeze(robot, cube.joints)
+    held = hold(CompiledEnergy(hand, field), wrist, *postures, obj.mass)
+    points, finger = pressed_contacts(hand, field, hand.forward(held.wrist, robot.reduce_hand(held.joints)))
+    assert (field.distance(cube.contacts[cube.contact_finger > 0]).abs() < 1e-3).all()
+    same = 0
+    for row in range(COUNT):
+        ours, again = cube.contacts[row][cube.contact_finger[row] > 0], points[row][finger[row] > 0]
+        same += ours.shape == again.shape and torch.allclose(ours, again, atol=1e-3)
+    assert same >= 0.75 * COUNT  # the model is steep where contacts begin, and poses were rounded
 
 
 def test_search_lowers_the_energy_and_the_penetration(robot):

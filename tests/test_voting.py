@@ -10,7 +10,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dora.affordance.contact_map import contact_semantic_map, hand_contacts, wrist_matrix
+from dora.affordance.contact_map import contact_semantic_map, hand_contacts, pressed_contacts, wrist_matrix
 from dora.affordance.hand import HandModel
 from dora.affordance.map import AffordanceMap
 from dora.affordance.objects import load_object
@@ -90,6 +90,7 @@ def box_map(labels: list[int]) -> AffordanceMap:
         ([0.0, 0.028], [3, 4], 0),  # 1 : 1, as many neighbours each: first name
         ([0.0, 0.028, 0.028], [3, 4, 4], 1),  # 1 : 1, and more neighbours are b
         ([0.0, 0.0, 0.028], [2, 2, 2], 0),  # mode within the thumb
+        ([0.016, 0.028], [2, 3], 1),  # a and b equally near the thumb, and more neighbours of all are b
     ],
 )
 def test_ties_and_empty_contacts(where, finger, expected):
@@ -155,3 +156,21 @@ def test_hand_contacts_lie_on_the_object():
     assert len(touching) > 0
     assert (touching.norm(dim=-1) - 0.03).abs().max() < 1e-3
     assert points.shape[:2] == part.shape == (1, len(hand.contacts.body.unique()))
+
+
+def test_pressed_contacts_are_the_overlapping_parts_on_the_surface():
+    """A ball between hand and nothing, deeper in the palm than in any finger; then far away."""
+    hand, radius = HandModel(load_robot("diana7_hit"), dtype=torch.float64), 0.03
+    field = SignedDistanceField(trimesh.creation.icosphere(subdivisions=3, radius=radius), dtype=torch.float64)
+    wrist = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    wrist[:, :3, 3] = -torch.tensor(hand.grip.center + 0.028 * hand.grip.normal)
+    wrist[1, 0, 3] += 1.0
+    poses = hand.forward(wrist, torch.zeros(2, len(hand.lower), dtype=torch.float64))
+    points, part = pressed_contacts(hand, field, poses)
+    gap = field.distance(hand.place(poses, hand.spheres)) - hand.sphere_radius
+    expected = hand.part[hand.spheres.body][gap[0] < 0]
+    assert len(expected) > 0
+    assert part[0].tolist() == expected.tolist()
+    assert not part[1].any()
+    assert points.shape[1] == len(expected)
+    assert (points[0].norm(dim=-1) - radius).abs().max() < 1e-3

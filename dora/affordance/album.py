@@ -6,7 +6,8 @@ from pathlib import Path
 
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand import HandModel
-from dora.affordance.pictures import caption, picture_contacts, picture_grasps
+from dora.affordance.objects import available_objects, load_object
+from dora.affordance.pictures import caption, picture_contacts, picture_grasps, picture_objects
 from dora.affordance.prepared import map_of
 from dora.affordance.structure import AffordanceObject
 from dora.affordance.viewing import Surface
@@ -15,6 +16,10 @@ from dora.robot import RobotDescription
 
 SHOWN = 4
 """Grasps in a picture."""
+EDGE = 0.002
+"""Longest edge of the triangles of a contact semantic map [m]."""
+OBJECTS = "objects.png"
+"""Name of the picture of all objects."""
 
 
 def write_album(
@@ -31,21 +36,36 @@ def write_album(
     Raises:
         InputError: the folder or a file cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"Cannot make the folder {folder} ({error.strerror}): choose another one.") from error
+    _make(folder)
     paths = [folder / f"{obj.name}-{what}.png" for what in ("map", "grasps", "contacts")]
     map_of(obj, "cpu").picture(paths[0])
     if candidates is None:
         return paths[:1]
     shown = candidates.select(chosen(candidates))
     picture_grasps(shown, obj, robot, paths[1])
-    surface, hand = Surface(obj), HandModel(robot)
+    surface, hand = Surface(obj, EDGE), HandModel(robot)
     maps = [surface.parts(shown, row, hand) for row in range(len(shown))]
     titles = [caption(shown, row) for row in range(len(shown))]
     picture_contacts(surface.mesh, maps, titles, obj.name, paths[2])
     return paths
+
+
+def write_objects(folder: Path) -> Path:
+    """Write a picture of all of Dora's objects into a folder; returns its path.
+
+    Raises:
+        InputError: the folder or the file cannot be written.
+    """
+    _make(folder)
+    picture_objects([load_object(name) for name in available_objects()], folder / OBJECTS)
+    return folder / OBJECTS
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"Cannot make the folder {folder} ({error.strerror}): choose another one.") from error
 
 
 def chosen(candidates: GraspCandidates) -> list[int]:

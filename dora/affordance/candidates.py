@@ -39,7 +39,7 @@ class GraspCandidates:
         grasp: (c, 20) commanded hand joints of the closed hand [rad]; beyond contact, so that they squeeze.
         grasp_class: c names such as "BodyGrasp" or "HandleGrasp".
         joints: (c, 20) hand joints at contact [rad]; `grasp` if not given.
-        contacts: (c, k, 3) contact points on the object [m]; k = 0 if not given.
+        contacts: (c, k, 3) points on the object on which the closed hand presses [m]; k = 0 if not given.
         contact_finger: (c, k) what touches there: 0 nothing, 1 palm, 2 thumb, ... 6 pinky.
         energy: (c,) per name of an energy term, unweighted.
         penetration: (c,) deepest overlap of hand and object at `joints` [m]; nan = not measured.

@@ -84,6 +84,27 @@ def hand_contacts(
     return onto, torch.where(touching, hand.part[bodies], 0)
 
 
+def pressed_contacts(
+    hand: HandModel, field: SignedDistanceField, poses: Float[Tensor, "c b 4 4"]
+) -> tuple[Float[Tensor, "c k 3"], Int[Tensor, "c k"]]:
+    """Contact points on the object of every sphere of the hand that overlaps with it, and their contact classes.
+
+    Rows are filled up with points of class 0 to the largest number of contacts.
+
+    Args:
+        hand: the hand.
+        field: of the object.
+        poses: of `HandModel.forward` of the closed hand, in the object frame.
+    """
+    centers = hand.place(poses, hand.spheres)
+    value, _ = field.sample(centers.flatten(0, 1), CHANNELS)
+    onto = centers - (value[:, :1] * value[:, 1:]).view_as(centers)
+    pressed = value[:, 0].view(centers.shape[:2]) < hand.sphere_radius
+    first = pressed.int().argsort(dim=1, descending=True, stable=True)[:, : int(pressed.sum(1).max())]
+    part = torch.where(pressed, hand.part[hand.spheres.body], 0)
+    return torch.take_along_dim(onto, first.unsqueeze(-1), 1), part.gather(1, first)
+
+
 def wrist_matrix(position: Float[Tensor, "c 3"], quaternion: Float[Tensor, "c 4"]) -> Float[Tensor, "c 4 4"]:
     """Homogeneous pose of a position (m) and a quaternion (wxyz)."""
     pose = torch.eye(4, dtype=position.dtype, device=position.device).repeat(len(position), 1, 1)

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from trimesh.visual import ColorVisuals
 
@@ -75,6 +75,11 @@ class HandMesh:
             joined([self.links[name].copy().apply_transform(pose[row]) for name, pose in poses.items()])
             for row in range(len(joints))
         ]
+
+    @property
+    def fingers(self) -> Bool[np.ndarray, " f"]:
+        """Which faces of `posed` are fingers', not the wrist's link."""
+        return np.concatenate([np.full(len(mesh.faces), name != self._wrist) for name, mesh in self.links.items()])
 
 
 def joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:

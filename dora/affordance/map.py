@@ -6,17 +6,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
 
-import imageio.v3 as imageio
 import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
+from trimesh.visual import ColorVisuals
 
 from dora.affordance.lookup import NearestTable, RegionField
-from dora.affordance.palette import PALETTE, colours
+from dora.affordance.palette import PALETTE, colours, legend_of
 from dora.affordance.rasteriser import Camera, render
 from dora.affordance.sampling import sample_evenly
+from dora.affordance.sheet import Panel, write_sheet
 from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
 from dora.files import read_tensors, write_bytes, write_tensors
@@ -27,6 +28,8 @@ FORMAT = "dora-map 1"
 """Format and version of a file of a map."""
 VIEWS = ((-1.0, 0.35), (2.4, 0.35))
 """Azimuth and elevation (rad) of the pictures."""
+PLAIN = (225, 225, 225, 255)
+"""Colour of the surface under the points."""
 DISC_CORNERS, DISC_SHARE, DISC_LIFT = 8, 0.85, 2e-4
 """Corners of a point's disc, its radius as a share of that with its area, and its distance (m) from the surface."""
 CANDIDATES_PER_NEIGHBOUR, FEWEST_CANDIDATES = 6, 48
@@ -185,25 +188,28 @@ class AffordanceMap:
         return trimesh.Trimesh(vertices, faces.reshape(-1, 3).numpy(), face_colors=colors, process=False)
 
     def picture(self, path: Path | str, size: int = 400) -> None:
-        """Write a PNG: the painted surface from the front and from behind, and the points as discs.
+        """Write a PNG: the painted surface from the front and from behind, and the points as discs on it.
 
         Args:
             path: of the file.
-            size: side of each of the three panels (pixels).
+            size: side of each of the three views (pixels).
 
         Raises:
             InputError: the file cannot be written.
         """
         own = self.to("cpu")
-        views = [(own.painted(), VIEWS[0]), (own.painted(), VIEWS[1]), (own.discs(), VIEWS[0])]
-        panels = []
-        for mesh, (azimuth, elevation) in views:
-            camera = Camera.around([self.mesh], azimuth, elevation)
-            panels.append(render([mesh], camera, size, size))
-        try:
-            imageio.imwrite(path, np.concatenate(panels, axis=1), extension=".png")
-        except OSError as error:
-            raise InputError(f"cannot write {path} ({error.strerror}); choose another folder.") from error
+        plain = trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False)
+        plain.visual = ColorVisuals(plain, face_colors=PLAIN)
+        shown = {
+            "regions, from the front": ([own.painted()], VIEWS[0]),
+            "from behind": ([own.painted()], VIEWS[1]),
+            f"the {len(self)} points of the map": ([plain, own.discs()], VIEWS[0]),
+        }
+        panels = [
+            Panel(render(meshes, Camera.around([self.mesh], *view), size, size), title)
+            for title, (meshes, view) in shown.items()
+        ]
+        write_sheet(panels, path, len(panels), legend_of(self.names), self.name)
 
     def export_glb(self, path: Path | str) -> None:
         """Write the painted surface as binary glTF (m), which every 3D viewer shows; raises InputError as `save`."""

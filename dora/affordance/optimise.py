@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.compiled import CompiledEnergy
-from dora.affordance.contact_map import hand_contacts
+from dora.affordance.contact_map import hand_contacts, pressed_contacts
 from dora.affordance.descent import Rows
 from dora.affordance.energies import GraspEnergy, Table
 from dora.affordance.holding import Steps, hold
@@ -125,11 +125,14 @@ def _candidates(
     faults = 4 * (depth > STANDARD.penetration).long() + 2 * (self_depth > STANDARD.strict_self_penetration).long()
     faults += (depth > SHALLOW).long()
     judged = faults.argsort(stable=True)[: _judged(faults, num)]
-    quality, predicted = _quality(obj, energy, rows, found.total, judged, num)
+    quality, predicted, closed = _quality(obj, energy, rows, found.total, judged, num)
     order = quality.argsort(descending=True)
     best = order[faults[order].argsort(stable=True)][:num]
     poses, joints, wrist = poses[best], rows.joints[best], rows.wrist[best]
-    points, finger = hand_contacts(hand, energy.field, poses)
+    if closed is None:
+        points, finger = hand_contacts(hand, energy.field, poses)
+    else:
+        points, finger = pressed_contacts(hand, energy.field, closed[best])
     held = vote(map_of(obj, str(points.device)), points, finger)
     full = robot.expand_hand(joints)
     normal = full.new_tensor(hand.grip.normal)
@@ -162,11 +165,11 @@ def _judged(faults: Tensor, num: int) -> int:
 
 def _quality(
     obj: AffordanceObject, energy: GraspEnergy, rows: Rows, total: Tensor, judged: Tensor, num: int
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """What candidates are ranked by (c,), more is better, and the predictions it is made of, for the rows judged; of
-    which the `num` best are wanted."""
+) -> tuple[Tensor, dict[str, Tensor], Tensor | None]:
+    """What candidates are ranked by (c,), more is better, the predictions it is made of, and poses (c, b, 4, 4) of the
+    closed hand, for the rows judged; of which the `num` best are wanted."""
     if not isinstance(energy, CompiledEnergy):
-        return -total, {}
+        return -total, {}, None
     robot = energy.hand.robot
     full = robot.expand_hand(rows.joints[judged])
     held = hold(energy, rows.wrist[judged], pregrasp(robot, full), squeeze(robot, full), obj.mass, wanted=num)
@@ -179,7 +182,9 @@ def _quality(
         "predicted_displacement": spread(held.displacement[:, -1], math.nan),
         "predicted_force": spread(held.force, math.nan),
     }
-    return spread(held.quality, -math.inf), predictions
+    closed = energy.hand.forward(held.wrist, robot.reduce_hand(held.joints))
+    poses = closed.new_full((len(total), *closed.shape[1:]), math.nan).index_copy_(0, judged, closed)
+    return spread(held.quality, -math.inf), predictions, poses
 
 
 def seated(energy: CompiledEnergy, rows: Rows, mass: float, squeezed: float) -> Rows:

@@ -17,3 +17,8 @@ def colours(indices: Int[np.ndarray, " n"], table: Sequence[tuple[int, int, int]
     return np.append(
         np.asarray(table, dtype=np.uint8)[indices % len(table)], np.full((len(indices), 1), 255, np.uint8), 1
     )
+
+
+def legend_of(labels: Sequence[str]) -> dict[str, tuple[int, int, int]]:
+    """The colour of every region of an object."""
+    return {label: PALETTE[index % len(PALETTE)] for index, label in enumerate(labels)}

@@ -20,8 +20,8 @@ CHUNK = 2_000_000
 MARGIN = 1.06
 """Factor of the lengths across the view, for a margin around what is shown."""
 LIGHT = (-0.35, 0.45, 0.82)
-"""Direction towards the light: to the right, up and towards the viewer (unnormalised)."""
-AMBIENT = 0.45
+"""Direction towards the light along the picture's right, its up and towards the viewer (unnormalised)."""
+AMBIENT = 0.6
 """Share of a face's colour that it shows when turned from the light."""
 
 
@@ -80,19 +80,30 @@ def render(
     Returns:
         (height, width, 3) red, green and blue.
     """
-    big = (height * OVERSAMPLING, width * OVERSAMPLING)
-    turn = camera.rotation
-    corners = np.concatenate([mesh.triangles for mesh in meshes]) - np.asarray(camera.eye)
-    corners = corners @ turn.T
+    turn, corners = camera.rotation, _corners(meshes, camera)
     normals = np.concatenate([mesh.face_normals for mesh in meshes]) @ turn.T
     colors = np.concatenate([face_colours(mesh)[:, :3] for mesh in meshes]).astype(float)
     light = np.asarray(LIGHT) / np.linalg.norm(LIGHT)
     facing = np.where(np.einsum("nd,nd->n", normals, corners[:, 0]) > 0, -1.0, 1.0)
     shade = AMBIENT + (1 - AMBIENT) * np.clip(facing * (normals @ light), 0, 1)
     shown = np.vstack([colors * shade[:, None], np.asarray(background, dtype=float)])
+    big = (height * OVERSAMPLING, width * OVERSAMPLING)
     nearest = _nearest_faces(_project(corners, camera.field, big), big)
     picture = shown[nearest].reshape(height, OVERSAMPLING, width, OVERSAMPLING, 3).mean((1, 3))
     return picture.round().astype(np.uint8)
+
+
+def seen(meshes: list[trimesh.Trimesh], camera: Camera, width: int, height: int) -> Int[np.ndarray, "h w"]:
+    """Index of the face seen in every pixel, counted through all meshes; the number of all faces where there is none.
+
+    Arguments as of `render`.
+    """
+    return _nearest_faces(_project(_corners(meshes, camera), camera.field, (height, width)), (height, width))
+
+
+def _corners(meshes: list[trimesh.Trimesh], camera: Camera) -> Float[np.ndarray, "f 3 3"]:
+    """Corners of all faces [m] along the picture's right, its up and towards the viewer, from the eye."""
+    return (np.concatenate([mesh.triangles for mesh in meshes]) - np.asarray(camera.eye)) @ camera.rotation.T
 
 
 def _project(corners: np.ndarray, field: float, size: tuple[int, int]) -> Float[np.ndarray, "f 3 3"]:

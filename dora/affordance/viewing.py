@@ -86,11 +86,11 @@ def describe(candidates: GraspCandidates, row: int) -> str:
 
 
 class Surface:
-    """The object's mesh, cut fine enough to carry colours."""
+    """The object's mesh, cut into triangles with edges of at most `edge` [m], which carry colours."""
 
-    def __init__(self, obj: AffordanceObject) -> None:
+    def __init__(self, obj: AffordanceObject, edge: float = EDGE) -> None:
         vertices, faces, *origin = trimesh.remesh.subdivide_to_size(
-            obj.mesh.vertices, obj.mesh.faces, EDGE, MOST_CUTS, return_index=True
+            obj.mesh.vertices, obj.mesh.faces, edge, MOST_CUTS, return_index=True
         )
         self.mesh = trimesh.Trimesh(vertices, faces, process=False)
         self.labels = obj.face_labels[origin[0]]

@@ -59,13 +59,15 @@ def _votes(voting: dict[str, Any]) -> Table:
     table = Table(title="part that carries most force after closing, and what the contacts vote for")
     for heading in ("grasps", "contacts", "balanced accuracy", *(f"{name} held: voted" for name in labels)):
         table.add_column(heading, overflow="fold")
-    for group in ("all", "clear"):
+    for group in ("all", "clear", "valid", "valid_clear"):
         for kind in ("candidate", "closed_hand"):
             found = voting[group][kind]
             cells = [_confused(row, [*labels, "none"]) for row in found["confusion"]]
             accuracy = found["balanced_accuracy"]
             share = "-" if accuracy is None else f"{accuracy:.3f}"
-            table.add_row(f"{group} ({voting[group]['grasps']})", kind.replace("_", " "), share, *cells)
+            table.add_row(
+                f"{group.replace('_', ', ')} ({voting[group]['grasps']})", kind.replace("_", " "), share, *cells
+            )
     return table
 
 

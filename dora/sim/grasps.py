@@ -24,15 +24,19 @@ from dora.affordance.voting import vote
 from dora.progress import PhaseProgress
 from dora.robot import RobotDescription
 from dora.sim.validation import Validation, validate
+from dora.sim.workers import prepare
 
 MILLIMETRES = 1000.0
 """Per metre."""
+_NO_CLOSURE = Weights(closure=0.0)
 BASELINES = {
-    "no_closure": Settings(weights=Weights(closure=0.0), seat=0.0),
-    "one_iteration": Settings(iterations=1, seat=0.0),
+    "no_closure": Settings(weights=_NO_CLOSURE),
+    "unseated": Settings(seat=0.0),
+    "unseated_no_closure": Settings(weights=_NO_CLOSURE, seat=0.0),
+    "unseated_one_iteration": Settings(iterations=1, seat=0.0),
 }
-"""Searches that lack what they are compared for: the weight of E_DFC is 0, or there is no search. The hand is not
-closed around the object after them, which would mend much of it."""
+"""Searches that lack what they are compared for: the weight of E_DFC is 0; the hand is not closed around the object
+after the search (`unseated`), which mends much of what a search lacks; both; or there is no search."""
 
 
 CANDIDATE, CLOSED = "candidate", "closed_hand"
@@ -98,6 +102,8 @@ def generate(
     """
     settings = settings or Settings()
     start = time.perf_counter()
+    if simulate:
+        prepare()
     report = phases.phase(f"{name}: search", "candidates", scale=1 / settings.iterations)
     found = optimise(obj, robot, num, seed, region, settings, progress=report)
     between = time.perf_counter()
@@ -190,13 +196,15 @@ def votes(candidates: GraspCandidates, verdict: Validation, obj: AffordanceObjec
 def voting_summary(several: Iterable[Generated], obj: AffordanceObject) -> dict[str, Any]:
     """Agreement of the votes with the region that carries most contact force after closing, as JSON can hold it.
 
-    Over the simulated grasps of all searches together whose hand presses on the object after closing: "all", and
-    "clear" where one region carries two thirds of the force or more.
+    Over the simulated grasps of all searches together whose hand presses on the object after closing: "all", "clear"
+    where one region carries two thirds of the force or more, and the same of the "valid" ones, which tasks use.
     """
     simulated = [(g.verdict, g.voting) for g in several if g.verdict is not None]
     force = torch.cat([verdict.label_force for verdict, _ in simulated])
+    pressed, clear = force.sum(1) > 0, clearly_held(force)
+    valid = torch.cat([verdict.valid for verdict, _ in simulated])
     voted = {kind: torch.cat([votes[kind] for _, votes in simulated]) for kind in (CANDIDATE, CLOSED)}
-    groups = {"all": force.sum(1) > 0, "clear": clearly_held(force)}
+    groups = {"all": pressed, "clear": clear, "valid": pressed & valid, "valid_clear": clear & valid}
     found: dict[str, Any] = {"labels": list(obj.labels)}
     for group, rows in groups.items():
         found[group] = {"grasps": int(rows.sum())}

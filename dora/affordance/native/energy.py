@@ -11,7 +11,8 @@ from dora.affordance.native.field import coarse, distance_to, sample
 from dora.affordance.native.hand import SMALL, cross, forward, point_of, pull_back, push, self_penetration, turn
 from dora.affordance.signed_distance import CHANNELS
 
-_CLOSURE, _DISTANCE, _REGION, _CLOSING, _PENETRATION, _TABLE, _LIMITS, _SELF = range(len(TERMS))
+CLOSURE, DISTANCE, REGION, CLOSING, PENETRATION, TABLE, LIMITS, SELF = range(len(TERMS))
+"""Places in `TERMS`."""
 
 
 class _Room(NamedTuple):
@@ -113,19 +114,19 @@ def make_room(hand, field, contacts):
 def _evaluate(hand, field, weights, plane, wrist, joints, contacts, room, every, terms, gradient):
     """Adds the terms of one candidate and their gradient; if not `every` term is asked for, only those that count."""
     poses, wrench = room.poses, room.wrench
-    if every or weights[_CLOSING] > 0.0:
+    if every or weights[CLOSING] > 0.0:
         forward(hand, wrist, joints, 1.0, room.angles, poses)
         wrench[:] = 0.0
-        terms[_CLOSING] = closing(hand, field, weights[_CLOSING], poses, contacts, wrench)
+        terms[CLOSING] = closing(hand, field, weights[CLOSING], poses, contacts, wrench)
         pull_back(hand, poses, wrench, gradient)
     forward(hand, wrist, joints, 0.0, room.angles, poses)
     wrench[:] = 0.0
     contact_terms(hand, field, weights, contacts, room, terms)
-    if every or weights[_CLOSURE] > 0.0:
-        terms[_CLOSURE] = closure(weights[_CLOSURE], hand.contact_body, contacts, room)
+    if every or weights[CLOSURE] > 0.0:
+        terms[CLOSURE] = closure(weights[CLOSURE], hand.contact_body, contacts, room)
     sphere_terms(hand, field, weights, plane, poses, terms, wrench)
-    terms[_SELF] = self_penetration(hand, weights[_SELF], 0.0, poses, room.ends, wrench)
-    terms[_LIMITS] = limits(hand, weights[_LIMITS], room.angles, gradient)
+    terms[SELF] = self_penetration(hand, weights[SELF], 0.0, poses, room.ends, wrench)
+    terms[LIMITS] = limits(hand, weights[LIMITS], room.angles, gradient)
     pull_back(hand, poses, wrench, gradient)
 
 
@@ -140,12 +141,12 @@ def contact_terms(hand, field, weights, contacts, room, terms):
         point = point_of(poses, body, local, contacts[k])
         sample(field, field.table, point, value, slope)
         importance = PALM_IMPORTANCE if body == 0 else 1.0
-        terms[_DISTANCE] += importance * abs(value[0])
-        pull = weights[_DISTANCE] * importance * np.sign(value[0])
+        terms[DISTANCE] += importance * abs(value[0])
+        pull = weights[DISTANCE] * importance * np.sign(value[0])
         along = 0.0
         if last >= CHANNELS:
-            terms[_REGION] += value[CHANNELS]
-            along = weights[_REGION]
+            terms[REGION] += value[CHANNELS]
+            along = weights[REGION]
         force = (
             pull * slope[0, 0] + along * slope[last, 0],
             pull * slope[0, 1] + along * slope[last, 1],
@@ -220,15 +221,15 @@ def sphere_terms(hand, field, weights, plane, poses, terms, wrench):
             depth = reach[s] - value
             if depth > 0.0:
                 inside += depth
-                w = -weights[_PENETRATION]
+                w = -weights[PENETRATION]
                 push(wrench, body, point, (w * slope[0], w * slope[1], w * slope[2]))
         depth = radius[s] - (nx * point[0] + ny * point[1] + nz * point[2] + offset)
         if depth > 0.0:
             below += depth
-            w = -weights[_TABLE]
+            w = -weights[TABLE]
             push(wrench, body, point, (w * nx, w * ny, w * nz))
-    terms[_PENETRATION] = inside
-    terms[_TABLE] = below
+    terms[PENETRATION] = inside
+    terms[TABLE] = below
 
 
 @native

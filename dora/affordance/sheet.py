@@ -1,0 +1,78 @@
+"""Sheets of pictures: several views in a grid, with titles and legends, as one PNG."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from dora.files import write_bytes
+
+Legend = Mapping[str, tuple[int, int, int]]
+"""Colours (red, green and blue, 0..255) by what they mean."""
+DPI = 100
+"""Pixels per inch of figures."""
+TITLE, LEGEND = 34, 50
+"""Room for a row of titles and for a row of legends [pixels]."""
+SIZE = 9
+"""Of letters [points]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One view: its pixels (h, w, 3), the title above it and, if it has colours of its own, the legend below it."""
+
+    view: UInt8[np.ndarray, "h w 3"]
+    title: str
+    legend: Legend = field(default_factory=dict)
+
+
+def write_sheet(
+    panels: Sequence[Panel], path: Path | str, columns: int, legend: Legend | None = None, name: str = ""
+) -> None:
+    """Write views of one size as a PNG.
+
+    Args:
+        panels: row by row.
+        path: of the file.
+        columns: views in a row.
+        legend: of all views together.
+        name: title of that legend.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    rows = -(-len(panels) // columns)
+    height, width, _ = panels[0].view.shape
+    own = LEGEND if any(panel.legend for panel in panels) else 0
+    size = columns * width / DPI, (rows * (height + TITLE + own) + (LEGEND if legend else 0)) / DPI
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis in axes:
+        axis.set_axis_off()
+    for axis, panel in zip(axes, panels, strict=False):
+        axis.imshow(panel.view)
+        axis.set_title(panel.title, fontsize=SIZE)
+        if panel.legend:
+            axis.legend(
+                handles=_patches(panel.legend), loc="upper center", bbox_to_anchor=(0.5, 0.0),
+                ncols=len(panel.legend), fontsize=SIZE, frameon=False,
+            )  # fmt: skip
+    if legend:
+        handles = _patches(legend)
+        figure.legend(
+            handles=handles, loc="outside lower center", ncols=len(handles), fontsize=SIZE, frameon=False, title=name
+        )
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    write_bytes(Path(path), content.getvalue())
+
+
+def _patches(legend: Legend) -> list[Patch]:
+    return [Patch(color=np.divide(colour, 255).tolist(), label=label) for label, colour in legend.items()]
