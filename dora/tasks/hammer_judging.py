@@ -99,7 +99,15 @@ def _kept(s: HammerSnapshot) -> Tensor:
 
 
 def _clean(s: HammerSnapshot) -> Tensor:
-    return ((s.nail_driven >= DRIVEN) & (s.stage > STRIKE) & (s.deepest <= DEEPEST)).float()
+    return (s.deepest <= DEEPEST).float()
+
+
+def _strike(s: HammerSnapshot) -> Tensor:
+    return _depth(s) * (0.3 + 0.7 * _clean(s))
+
+
+def _driven(s: HammerSnapshot) -> Tensor:
+    return ((s.nail_driven >= DRIVEN) & (s.stage > STRIKE)).float() * _clean(s)
 
 
 TERMS: Terms[HammerSnapshot] = Terms(
@@ -125,8 +133,12 @@ TERMS: Terms[HammerSnapshot] = Terms(
             1.0,
             doc="closeness of theta, the angle from striking axis to nail axis, and of the face to the nail",
         ),
-        "strike": Term(_depth, 2.0, doc="depth driven by blows, saturating at the target depth"),
-        "driven": Term(_clean, 1.5, doc="all stages done, and no overlap above 5 mm so far"),
+        "strike": Term(
+            _strike,
+            2.0,
+            doc="depth driven by blows, saturating at the target depth; 0.3 of it after an overlap above 5 mm",
+        ),
+        "driven": Term(_driven, 1.5, doc="all stages done, and no overlap above 5 mm so far"),
         **penalties(0.001, DEEPEST),
     }
 )
