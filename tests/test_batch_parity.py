@@ -10,7 +10,7 @@ import torch
 
 import dora.sim
 
-STEPS = 60
+STEPS = 100
 TASKS = (
     "PickCube-v1",
     "StackCube-v1",
