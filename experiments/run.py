@@ -8,6 +8,7 @@ path is the last line printed. Ctrl-C saves; `--resume FOLDER` goes on.
 
 import datetime
 import functools
+import logging
 import shlex
 import sys
 from dataclasses import dataclass
@@ -200,6 +201,7 @@ def film(checkpoint: Path, config: RunConfig, path: Path) -> None:
 def main() -> int:
     """Run the command; returns the exit status."""
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
     try:
         if args.eval_only:
             folder, finished = evaluate_only(args), True

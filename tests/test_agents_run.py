@@ -7,7 +7,7 @@ import pytest
 from commands import call, load_command
 
 from dora.agents.config import LEARNER_CONFIGS
-from dora.agents.presets import DEFAULT_AGENT, PRESETS, RECOMMENDED_AGENT, recommended
+from dora.agents.presets import PRESETS, recommended
 from dora.agents.runfolder import RunFolder
 
 
@@ -63,10 +63,9 @@ def test_resume_refuses_another_task(
 
 
 def test_a_bare_command_takes_the_learner_recommended_for_the_task():
-    chosen = {env: recommended(env) for env in (*RECOMMENDED_AGENT, "DoraCube-v1", "PickCube-v1")}
-    for env, config in chosen.items():
-        assert config.agent == RECOMMENDED_AGENT.get(env, DEFAULT_AGENT)
+    chosen = {env: recommended(env) for env in ("DoraCube-v1", "DoraJug-v1", "DoraHammer-v1", "PickCube-v1")}
+    assert [config.agent for config in chosen.values()] == ["ppo", "sac", "sac", "ppo"]
+    for config in chosen.values():
         assert isinstance(config.learner, LEARNER_CONFIGS[config.agent])
-    for env, agent in RECOMMENDED_AGENT.items():
-        assert chosen[env].total_steps == PRESETS[env, agent]["total_steps"]
-        assert recommended(env, "ppo").agent == "ppo"
+    assert chosen["DoraJug-v1"].total_steps == PRESETS["DoraJug-v1", "sac"]["total_steps"]
+    assert recommended("DoraJug-v1", "ppo").agent == "ppo"

@@ -21,6 +21,7 @@ from dora.agents.checkpoint import read_checkpoint
 from dora.agents.collect import Rollouts
 from dora.agents.config import PPOConfig, RunConfig, SACConfig
 from dora.agents.logging import TAGS
+from dora.agents.networks import last_layer
 from dora.agents.play import evaluate_checkpoint, record
 from dora.agents.ppo import PPO
 from dora.agents.runfolder import RunFolder
@@ -37,6 +38,7 @@ BASE = RunConfig(
     "Fake-v1", "ppo", "affordance", num_envs=16, workers=0, eval_envs=16, eval_episodes=16, final_episodes=40
 )
 SMALL_PPO = PPOConfig(rollout=16, minibatch=128, hidden=(32, 32))
+SMALL_SAC = SACConfig(rollout=8, batch=64, warmup=256, critic_only=8, hidden=(32, 32))
 
 
 class Drifting(PointMass):
@@ -133,21 +135,48 @@ def test_stop_success_needs_two_evaluations_in_a_row(tmp_path: Path):
     assert run(tmp_path / "run", config)["env_steps"] == 1024
 
 
-def test_worker_processes_learn_repeat_and_leave_nothing_behind(tmp_path: Path):
-    config = dataclasses.replace(BASE, workers=2, num_envs=8, learner=SMALL_PPO, total_steps=2048)
+@pytest.mark.parametrize(("agent", "learner"), [("ppo", SMALL_PPO), ("sac", SMALL_SAC)])
+def test_worker_processes_learn_repeat_and_leave_nothing_behind(tmp_path: Path, agent: str, learner: Any):
+    config = dataclasses.replace(BASE, agent=agent, workers=2, num_envs=8, learner=learner, total_steps=2048)
     before = children()
     results = [run(tmp_path / name, config) for name in "ab"]
     assert results[0]["env_steps"] == 2048
-    a, b = (weights(tmp_path / name)["actor/mean.0.weight"] for name in "ab")
+    name = "actor/mean.0.weight" if agent == "ppo" else "actor/net.0.weight"
+    a, b = (weights(tmp_path / run_name)[name] for run_name in "ab")
     assert torch.equal(a, b)
     assert children() == before
 
 
-def test_the_message_of_a_failing_worker_arrives():
+class Slow(PointMass):
+    """A task that takes its time."""
+
+    def step(self, action: Tensor) -> Any:
+        time.sleep(0.02)
+        return super().step(action)
+
+
+def test_batches_collected_ahead_are_of_the_policy_before(tmp_path: Path):
+    learner = PPO(dataclasses.replace(SMALL_PPO, log_std=-3.0), 4, 2, 1000)
+    actor: Any = learner.actor
+    rollouts = Rollouts(
+        functools.partial(Slow, 4), learner.policy,
+        workers=2, num_envs=4, rollout=8, seeds=[0, 1], stagger=False, ahead=True,
+    )  # fmt: skip
+    means: list[float] = []
+    with rollouts, torch.no_grad():
+        for call in range(4):
+            batch = rollouts.collect()
+            last_layer(actor.mean).bias.fill_(call + 1.0)  # while the workers are at the next batch
+            means.append(float(batch["action"].mean()))
+    assert [round(mean) for mean in means] == [0, 0, 1, 2]
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_the_message_of_a_failing_worker_arrives(ahead: bool):
     learner = PPO(SMALL_PPO, 4, 2, 1000)
     rollouts = Rollouts(
         functools.partial(Drifting, 4), learner.policy,
-        workers=1, num_envs=4, rollout=8, seeds=[0], stagger=False,
+        workers=1, num_envs=4, rollout=8, seeds=[0], stagger=False, ahead=ahead,
     )  # fmt: skip
     with rollouts, pytest.raises(InputError, match="environment 3 is NaN"):
         rollouts.collect()

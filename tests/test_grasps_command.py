@@ -78,13 +78,14 @@ def test_files_and_table(
 ):
     monkeypatch.setattr(grasps, "BASELINES", {name: QUICK for name in grasps.BASELINES})
     monkeypatch.setattr(grasps, "Settings", lambda: QUICK)
+    monkeypatch.setenv("COLUMNS", "200")  # headings are not wrapped
     out = tmp_path / "new" / "jug.safetensors"
     arguments = ("--object", "jug", "--num", "6", "--baselines", "3", "--seed", "4", "--out", str(out))
     assert call(script, monkeypatch, *arguments) == 0
     shown = capsys.readouterr().out
     assert shown.splitlines()[-1] == str(out)
-    assert "no closure" in shown
-    assert "iteration" in shown
+    assert "unseated no closure" in shown
+    assert "unseated one iteration" in shown
     report = json.loads(out.with_suffix(".json").read_text())
     candidates = GraspCandidates.load(out, load_object("jug"), load_robot("diana7_hit"))
     assert set(report) >= KEYS

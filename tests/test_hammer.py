@@ -15,6 +15,7 @@ from dora.robot.rotations import quaternion_apply, quaternion_from_rotation_vect
 from dora.sim.substeps import watch_physics
 from dora.tasks import hammer
 from dora.tasks.catching import ALIGN, PHASES, CatchReference
+from dora.tasks.hammer_judging import AFTER_OVERLAP
 from dora.tasks.hammer_snapshot import GRIP, HammerSnapshot, face_to_nail, handle_distance, misalignment
 from dora.tasks.hammering import Strike, arrival, blend, compose, fall_time, fallen, inverse, relative, slew, slid
 from dora.tasks.nail import BLOW_SPEED, TRAVEL
@@ -173,6 +174,8 @@ def test_depth_pays_until_the_target_and_only_if_driven():
     depth = torch.tensor([0.0, 0.005, 0.010, 0.020])
     driven = hammer.TERMS.terms["strike"].value(invented(4, nail_driven=depth, nail_depth=depth))
     torch.testing.assert_close(driven, torch.tensor([0.0, 0.5, 1.0, 1.0]))
+    spoiled = hammer.TERMS.terms["strike"].value(invented(4, nail_driven=depth, deepest=torch.full((4,), 0.006)))
+    torch.testing.assert_close(spoiled, AFTER_OVERLAP * driven)
     pushed = hammer.TERMS.terms["strike"].value(invented(4, nail_depth=depth))
     assert (pushed == 0).all()
 

@@ -126,6 +126,14 @@ def test_jugs_start_at_any_yaw(task: jug.JugEnv):
     assert (share > 0.03).all()
 
 
+def test_what_fails_in_the_end_is_no_success(task: jug.JugEnv, monkeypatch: pytest.MonkeyPatch):
+    assert task.evaluate()["success"].any()
+    assert not task.failed(task.snapshot)[task.evaluate()["success"]].any()
+    monkeypatch.setattr(task, "failed", lambda s: torch.ones(STARTS, dtype=torch.bool))
+    assert task.evaluate()["finished"].any()
+    assert not task.evaluate()["success"].any()
+
+
 def test_falling_over_and_being_dropped_are_failures(task: jug.JugEnv):
     s = task.snapshot
     assert jug.held(s).any()

@@ -1,9 +1,12 @@
 """Rollouts by TorchRL collectors, in this process or in worker processes that each hold a task batch."""
 
+import copy
 import functools
+import os
 import signal
 import tempfile
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -18,6 +21,7 @@ from dora.agents.networks import Policy
 from dora.errors import InputError
 
 SHUTDOWN_SECONDS = 10.0  # workers that have not ended by then are killed
+LESS_URGENT = 5  # niceness of workers beside a busy learner, which all wait for
 
 
 class WorkerTaskEnv(TaskEnv):
@@ -49,8 +53,9 @@ def _reported(report: Path) -> Iterator[None]:
         raise
 
 
-def _make_worker_env(make_task: TaskFactory, report: Path, seed: int, stagger: bool) -> WorkerTaskEnv:
+def _make_worker_env(make_task: TaskFactory, report: Path, seed: int, stagger: bool, nice: int) -> WorkerTaskEnv:
     torch.set_num_threads(1)
+    os.nice(nice)
     torch.manual_seed(seed)
     with _reported(report):
         return WorkerTaskEnv(make_task(), report, seed=seed, stagger=stagger)
@@ -61,11 +66,14 @@ class Rollouts:
 
     Args:
         make_task: makes one task batch; called once in each worker.
-        policy: acts; the workers use copies, which `push` brings up to date.
+        policy: acts; the workers use copies, brought up to date before each batch is begun.
         workers: worker processes, or 0 to collect in this process.
         rollout: control steps per environment and batch.
         seeds: one per worker (one if `workers` is 0), for its tasks and its exploration.
         stagger: see `TaskEnv`.
+        ahead: workers go on with the next batch while the caller learns from this one, so that all cores are busy;
+            a batch then comes from the policy as it was one call of `collect` earlier. Without workers it changes
+            nothing.
     """
 
     def __init__(
@@ -78,7 +86,12 @@ class Rollouts:
         rollout: int,
         seeds: Sequence[int],
         stagger: bool,
+        ahead: bool = False,
     ):
+        self._policy = policy
+        self._acting = copy.deepcopy(policy) if workers > 0 else policy  # the workers share its memory
+        self._waiting = ThreadPoolExecutor(1) if ahead and workers > 0 else None
+        self._next: Future[TensorDictBase] | None = None
         self._scratch = tempfile.TemporaryDirectory(prefix="dora-workers-")
         self._reports = [Path(self._scratch.name) / str(i) for i in range(max(workers, 1))]
         if workers == 0:
@@ -93,13 +106,13 @@ class Rollouts:
             )
         else:
             factories = [
-                functools.partial(_make_worker_env, make_task, report, seed, stagger)
+                functools.partial(_make_worker_env, make_task, report, seed, stagger, LESS_URGENT if ahead else 0)
                 for report, seed in zip(self._reports, seeds, strict=True)
             ]
             with sigint_blocked(), self._explained():
                 self._collector = MultiSyncCollector(
                     factories,
-                    policy,
+                    self._acting,
                     frames_per_batch=workers * num_envs * rollout,
                     total_frames=-1,
                     cat_results=0,
@@ -119,15 +132,28 @@ class Rollouts:
             RuntimeError: if a worker failed otherwise.
         """
         with self._explained():
-            return next(self._iterator)
+            if self._waiting is None:
+                self._push()
+                return next(self._iterator)
+            batch = (self._next or self._begin(self._waiting)).result().clone()
+            self._next = self._begin(self._waiting)
+            return batch
 
-    def push(self) -> None:
-        """Give the workers the present weights and normaliser of the policy."""
+    def _begin(self, waiting: ThreadPoolExecutor) -> Future[TensorDictBase]:
+        """Lets the workers collect, with the present policy, while a thread waits for them."""
+        self._push()
+        return waiting.submit(next, self._iterator)
+
+    def _push(self) -> None:
+        """Gives the workers the present weights and normaliser of the policy."""
         if isinstance(self._collector, MultiSyncCollector):
+            self._acting.load_state_dict(self._policy.state_dict())
             self._collector.update_policy_weights_()
 
     def close(self) -> None:
         """End the workers."""
+        if self._waiting is not None:
+            self._waiting.shutdown()  # the batch that is under way
         self._collector.shutdown(timeout=SHUTDOWN_SECONDS)
         self._scratch.cleanup()
 

@@ -8,8 +8,9 @@ from dora.agents.config import GUIDANCES, LEARNER_CONFIGS, SINGLE_ARM_AGENTS, Ru
 from dora.errors import InputError
 
 DEFAULT_AGENT = "ppo"
+"""The learner of a bare command."""
 RECOMMENDED_AGENT: dict[str, str] = {"DoraJug-v1": "sac", "DoraHammer-v1": "sac"}
-"""The learner of a bare command, where it is not `DEFAULT_AGENT`."""
+"""The same for tasks on which another one does better."""
 
 PRESETS: dict[tuple[str, str], dict[str, Any]] = {
     ("DoraCube-v1", "ppo"): {

@@ -105,7 +105,9 @@ class Trainer:
                 with self._rollouts() as rollouts, ProgressReport(self.config.total_steps) as progress:
                     self._train(rollouts, log, progress, interrupt)
                 self.save()
+                progress.say(f"last evaluation of the best policy, on {self.config.final_episodes} episodes ...")
                 evaluation, zero = self._final_evaluation(interrupt)
+                progress.say(_outcome(evaluation, zero))
                 finished = True
             except KeyboardInterrupt:
                 self.save()
@@ -137,6 +139,7 @@ class Trainer:
             rollout=self.learner.rollout,
             seeds=seeds_for(config.seed, self.counters.env_steps + 1, max(config.workers, 1)),
             stagger=config.stagger,
+            ahead=self.learner.replay is not None,
         )
         if self._resumed is not None:
             unpack_rng(self._resumed)
@@ -153,7 +156,6 @@ class Trainer:
             batch = rollouts.collect()
             collected = time.perf_counter()
             values = self.learner.update(batch)
-            rollouts.push()
             counters.env_steps += batch.numel()
             ended = ended_episodes(batch["next", "done"], batch["next", "statistics"], self.columns)
             counters.episodes += len(ended)
@@ -280,6 +282,15 @@ class Trainer:
         if self.learner.replay is not None:
             self.learner.replay.load(self.folder.replay)
         self._resumed = checkpoint.tensors
+
+
+def _outcome(evaluation: Evaluation, zero: Evaluation | None) -> str:
+    """What a run tells in the end."""
+    text = f"success {evaluation.success_rate:.3f}"
+    if zero is not None:
+        text += f", without any correction {zero.success_rate:.3f}"
+    depth = evaluation.penetration_mm(0.95)
+    return text + (f", penetration p95 {depth:.1f} mm" if depth is not None else "")
 
 
 def _or_nan(value: float | None) -> float:

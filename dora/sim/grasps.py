@@ -24,7 +24,7 @@ from dora.affordance.voting import vote
 from dora.progress import PhaseProgress
 from dora.robot import RobotDescription
 from dora.sim.validation import Validation, validate
-from dora.sim.workers import prepare
+from dora.sim.workers import warm_up
 
 MILLIMETRES = 1000.0
 """Per metre."""
@@ -103,7 +103,7 @@ def generate(
     settings = settings or Settings()
     start = time.perf_counter()
     if simulate:
-        prepare()
+        warm_up()
     report = phases.phase(f"{name}: search", "candidates", scale=1 / settings.iterations)
     found = optimise(obj, robot, num, seed, region, settings, progress=report)
     between = time.perf_counter()

@@ -21,8 +21,6 @@ TABLE_HALF = (1.0, 1.0, 0.05)
 ANGULAR_DAMPING = 0.05
 """PhysX's default damping of rotation [1/s]."""
 _ZERO = np.zeros(3, np.float32)
-_AWAY = [5.0, 5.0, 5.0]
-"""Where the hand cannot touch the object [m]."""
 
 
 @dataclass(frozen=True)
@@ -120,11 +118,6 @@ class Rig:
         entity = sapien.Entity()
         entity.add_component(top)
         self._scene.add_entity(entity)
-
-    def forget(self) -> None:
-        """Lets PhysX forget the contacts of the grasp before: it makes a step with the object far away."""
-        self._entity.set_pose(sapien.Pose(_AWAY))
-        self.step()
 
     def place(self, position: np.ndarray, quaternion: np.ndarray) -> None:
         """Puts the object at rest, origin (3,) [m] and orientation wxyz (4,) in the world."""

@@ -142,8 +142,6 @@ class GripTest:
 
     def __call__(self, case: Case) -> Trial:
         """Closes the hand and, if the object is still there, tries all directions."""
-        self.rig.hand.reset(case.pregrasp)
-        self.rig.forget()
         self.rig.place(case.position, case.quaternion)
         self.rig.hand.reset(case.pregrasp)
         shift = self._close(case)
@@ -207,8 +205,8 @@ def validate(
 ) -> Validation:
     """Tests every candidate in SAPIEN.
 
-    Equal candidates give equal results but for rare borderline cases: PhysX is made to forget the contacts of the grasp
-    before, which leaves the order in which bodies are looked at.
+    Equal candidates give equal results but for rare borderline cases: PhysX remembers contacts of the grasp before,
+    which changes the last bits.
 
     Args:
         candidates: of this object and this robot.

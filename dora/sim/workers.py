@@ -70,7 +70,7 @@ def run_cases(
     return [found[i] for i in range(len(cases))]
 
 
-def prepare() -> None:
+def warm_up() -> None:
     """Begin to import, beside other work, what the processes of `run_cases` will need; returns at once."""
     if "forkserver" in get_all_start_methods() and available_cores() > 1:
         _context()

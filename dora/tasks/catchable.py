@@ -9,7 +9,8 @@ from torch import Tensor
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.protocol import flexion
 from dora.robot import RobotDescription
-from dora.robot.rotations import quaternion_apply, quaternion_multiply, rotation_angle
+from dora.robot.rotations import quaternion_apply, rotation_angle
+from dora.tasks.choice import in_world
 from dora.tasks.hammering import slid
 
 REACH = (0.16, 0.16)
@@ -37,15 +38,14 @@ def within_reach(
         home_p: the wrist's start [m], world frame.
         home_q: its orientation.
     """
-    b, c = len(object_p), len(candidates)
-    each = object_q.repeat_interleave(c, 0)
-    offset = quaternion_apply(each, candidates.position.repeat(b, 1))
-    goal = object_p.repeat_interleave(c, 0) + offset, quaternion_multiply(each, candidates.quaternion.repeat(b, 1))
-    axis = quaternion_apply(each, torch.tensor([0.0, 0.0, 1.0], device=object_p.device).expand(b * c, 3))
-    position, quaternion = slid(goal, axis, home_p[:, 2].expand(b * c))
-    away = (position - home_p)[:, :2].abs()
+    position, quaternion = in_world(candidates.position, candidates.quaternion, object_p, object_q)
+    b, c = position.shape[:2]
+    up = torch.tensor([0.0, 0.0, 1.0], device=object_p.device).expand_as(object_p)
+    axis = quaternion_apply(object_q, up).repeat_interleave(c, 0)
+    goal = slid((position.flatten(0, 1), quaternion.flatten(0, 1)), axis, home_p[:, 2].expand(b * c))
+    away = (goal[0] - home_p)[:, :2].abs()
     near = (away <= away.new_tensor(REACH)).all(-1)
-    return (near & (rotation_angle(quaternion, home_q.expand(b * c, 4)) <= TURN)).view(b, c)
+    return (near & (rotation_angle(goal[1], home_q.expand(b * c, 4)) <= TURN)).view(b, c)
 
 
 def with_waiting_hand(candidates: GraspCandidates, robot: RobotDescription, posture: str) -> GraspCandidates:

@@ -25,6 +25,20 @@ ERROR_DRAWS = 26
 """Random numbers of the candidates' error: 3 position, 3 rotation, 20 joints."""
 
 
+def in_world(
+    position: Float[Tensor, "*#b k 3"],
+    quaternion: Float[Tensor, "*#b k 4"],
+    object_p: Float[Tensor, "b 3"],
+    object_q: Float[Tensor, "b 4"],
+) -> tuple[Float[Tensor, "b k 3"], Float[Tensor, "b k 4"]]:
+    """World wrist poses of k grasps, the same for all objects or k of each, given in the frames of b objects [m]."""
+    each = object_q[:, None].expand(-1, position.shape[-2], 4)
+    return (
+        object_p[:, None] + quaternion_apply(each, position.expand(len(each), -1, 3)),
+        quaternion_multiply(each, quaternion.expand(len(each), -1, 4)),
+    )
+
+
 class Choice:
     """The candidates in use, one row per environment; poses in the object frame, the error included.
 
@@ -60,10 +74,8 @@ class Choice:
     ) -> Int[Tensor, "b k"]:
         """Indices of the k best candidates: reachable before unreachable, well ranked before lower ones, then by
         distance from the wrist. With fewer than k reachable ones, the first is repeated."""
-        c, b, count = self.candidates, len(object_p), len(self.candidates)
-        each = object_q[:, None].expand(b, count, 4)
-        goal_p = object_p[:, None] + quaternion_apply(each, c.position.expand(b, count, 3))
-        goal_q = quaternion_multiply(each, c.quaternion.expand(b, count, 4))
+        b, count = len(object_p), len(self.candidates)
+        goal_p, goal_q = in_world(self.candidates.position, self.candidates.quaternion, object_p, object_q)
         away = (goal_p - wrist_p[:, None]).norm(dim=-1)
         turn = rotation_angle(goal_q, wrist_q[:, None].expand(b, count, 4))
         score = torch.where(reachable, self._score, -1.0)
@@ -101,9 +113,9 @@ class Choice:
     ) -> tuple[Float[Tensor, "n k 3"], Float[Tensor, "n k 4"], Float[Tensor, "n 3"]]:
         """World wrist positions and orientations that the candidates ask for at the objects' poses, and the
         direction of the first one's approach."""
-        b, each = self.buffers, object_q[:, None].expand(-1, NEAREST, 4)
-        position = object_p[:, None] + quaternion_apply(each, b["position"])
-        return position, quaternion_multiply(each, b["quaternion"]), quaternion_apply(object_q, b["approach"])
+        b = self.buffers
+        goals = in_world(b["position"], b["quaternion"], object_p, object_q)
+        return *goals, quaternion_apply(object_q, b["approach"])
 
     def get_state(self) -> dict[str, Tensor]:
         """Copies of all buffers by name."""

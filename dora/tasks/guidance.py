@@ -73,12 +73,20 @@ APPROACH, DESCEND, CLOSE, LIFT = range(4)
 
 
 class GraspReference(Reference):
-    """Grasps the chosen candidate and lifts: ramps, the pose at which the wrist was latched, its last target."""
+    """Grasps the chosen candidate and lifts: ramps, the pose at which the wrist was latched, its last target.
+
+    Args:
+        num_envs: number of environments.
+        device: where the buffers are.
+        hover: height above the beginning of the approach that the wrist keeps for each radian it still has to turn
+            [m/rad], so that a tall object is not swept over by the turning hand.
+    """
 
     PHASES = PHASES
 
-    def __init__(self, num_envs: int, device: torch.device):
+    def __init__(self, num_envs: int, device: torch.device, hover: float = 0.0):
         super().__init__(num_envs, device)
+        self.hover = hover
 
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(num_envs, *shape, device=device)
@@ -105,6 +113,7 @@ class GraspReference(Reference):
         """
         b, phase = self.buffers, self.phase.index
         free = s.goal_p - s.goal_approach * b["standoff"][:, None]
+        free[:, 2] += torch.where(phase == APPROACH, self.hover * rotation_angle(s.goal_q, s.wrist_q), 0.0)
         up = torch.zeros_like(free)
         up[:, 2] = b["raised"]
         latched = (phase >= CLOSE)[:, None]

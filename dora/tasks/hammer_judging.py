@@ -36,6 +36,8 @@ DROPPED = 0.12
 """Distance of the handle from the middle of the grip at which the hammer is lost [m]."""
 DEEPEST = 0.005
 """Penetration above which an episode does not count as a success [m]."""
+AFTER_OVERLAP = 0.3
+"""Share of what blows earn that is left once an overlap was deeper than that."""
 
 
 def _in_hand(s: HammerSnapshot) -> Tensor:
@@ -103,7 +105,7 @@ def _clean(s: HammerSnapshot) -> Tensor:
 
 
 def _strike(s: HammerSnapshot) -> Tensor:
-    return _depth(s) * (0.3 + 0.7 * _clean(s))
+    return _depth(s) * (AFTER_OVERLAP + (1 - AFTER_OVERLAP) * _clean(s))
 
 
 def _driven(s: HammerSnapshot) -> Tensor:
@@ -136,7 +138,7 @@ TERMS: Terms[HammerSnapshot] = Terms(
         "strike": Term(
             _strike,
             2.0,
-            doc="depth driven by blows, saturating at the target depth; 0.3 of it after an overlap above 5 mm",
+            doc=f"depth driven by blows, saturating at the target; {AFTER_OVERLAP:g} of it after an overlap above 5 mm",
         ),
         "driven": Term(_driven, 1.5, doc="all stages done, and no overlap above 5 mm so far"),
         **penalties(0.001, DEEPEST),

@@ -101,10 +101,10 @@ class JudgedEnv(BaseEnv):
 
     def evaluate(self) -> dict[str, Tensor]:
         """Idempotent: reset and wrappers call it too, so it moves nothing."""
-        finished = self.machine.finished
+        finished, fail = self.machine.finished, self.failed(self.snapshot) | self.unreachable
         info = {
-            "success": finished & ~self.spoiled,
-            "fail": self.failed(self.snapshot) | self.unreachable,
+            "success": finished & ~self.spoiled & ~fail,
+            "fail": fail,
             "unreachable": self.unreachable,
             "finished": finished,
             "stage": self.machine.index.clone(),

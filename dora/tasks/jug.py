@@ -21,7 +21,9 @@ from dora.affordance.voting import vote
 from dora.robot.rotations import quaternion_apply
 from dora.sim.objects import build_object
 from dora.tasks.base import STANDING_DRAWS, DoraEnv
+from dora.tasks.guidance import GraspReference
 from dora.tasks.observations import Entry
+from dora.tasks.reference import Reference
 from dora.tasks.rewards import Term, Terms, closeness
 from dora.tasks.snapshot import (
     TIP_RADIUS,
@@ -72,6 +74,9 @@ CLASS = "HandleGrasp"
 """The grasp class that the task asks for."""
 MOST = 40
 """Stored candidates that the task works with."""
+HOVER = 0.06
+"""Height that the hand keeps above the approach for each radian it still has to turn [m/rad]: it is above at first and
+would sweep over the jug."""
 FEWEST_LIFTS = 0.5
 """Share of executed lifts that a ranked candidate must have survived to be one of them."""
 
@@ -259,6 +264,9 @@ class JugEnv(DoraEnv):
 
     def candidates(self) -> GraspCandidates:
         return best_candidates(self.OBJECT, CLASS, FEWEST_LIFTS, MOST)
+
+    def make_reference(self) -> Reference:
+        return GraspReference(self.num_envs, self.device, HOVER)
 
     def load_object(self, scale: np.ndarray) -> Actor:
         half = torch.as_tensor(jug().mesh.extents / 2, dtype=torch.float32, device=self.device)

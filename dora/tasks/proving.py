@@ -141,15 +141,16 @@ def usable_in_task(name: str) -> Callable[[GraspCandidates], Bool[Tensor, " c"]]
     """
     if name not in TASKS or name not in OFF_TABLE:
         return None
-    env_id = TASKS[name]
+    made: list[DoraEnv] = []
 
     def usable(candidates: GraspCandidates) -> Bool[Tensor, " c"]:
-        task = make_task(env_id, STARTS, grasps=candidates)
-        task.reset(seed=SEED)
+        if not made:
+            made.append(make_task(TASKS[name], STARTS, grasps=candidates))
+            made[0].reset(seed=SEED)
+        [task] = made
+        task.guide.choice.candidates = candidates.to(task.device)
         pose = task.target_object.pose
-        reached = task.reachable(pose.p, pose.q).float().mean(0) >= USABLE
-        task.close()
-        return reached.cpu()
+        return (task.reachable(pose.p, pose.q).float().mean(0) >= USABLE).cpu()
 
     return usable
 
