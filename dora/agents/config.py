@@ -59,7 +59,7 @@ class SACConfig:
 
     rollout: int = 16
     """Control steps per environment and iteration."""
-    batch: int = 512
+    batch: int = 256
     """Transitions per gradient step."""
     updates_per_step: float = 1 / 32
     """Gradient steps per environment step."""
