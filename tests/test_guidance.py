@@ -9,9 +9,11 @@ from invented import invented
 import dora.tasks as tasks
 from dora.affordance.candidates import GraspCandidates
 from dora.errors import InputError
+from dora.robot.rotations import quaternion_from_rotation_vector
 from dora.tasks.choice import Choice
 from dora.tasks.correction import SMOOTHING, Bounds, Correction, Target
 from dora.tasks.disturbances import SENSOR_DRAWS, Disturbances, uniform
+from dora.tasks.guidance import DESCEND, STANDOFF, GraspReference
 from dora.tasks.options import PARTS
 from dora.tasks.presets import PRESETS, Preset
 
@@ -88,6 +90,23 @@ def test_corrections_are_low_passed_bounded_and_in_the_hand_frame():
     torch.testing.assert_close(halved.wrist_p, torch.tensor([[0.0, 0.01, 0.0]]), atol=1e-6, rtol=0)
     with pytest.raises(InputError, match="between 0 and 1"):
         correction.set_scale(1.5)
+
+
+def test_the_hand_stays_higher_until_it_has_turned():
+    turn = torch.zeros(3, 3)
+    turn[:, 1] = torch.tensor([0.0, 0.5, 1.0])
+    goal_p = torch.tensor([[0.1, 0.2, 0.3]]).repeat(3, 1)
+    s = invented(
+        3, wrist_q=quaternion_from_rotation_vector(turn), goal_p=goal_p, goal_approach=-torch.eye(3)[[2, 2, 2]]
+    )
+    for hover, rise in ((0.0, [0.0, 0.0, 0.0]), (0.06, [0.0, 0.03, 0.06])):
+        reference = GraspReference(3, CPU, hover)
+        reference.begin(torch.arange(3), goal_p, s.wrist_q)
+        expected = goal_p.clone()
+        expected[:, 2] += STANDOFF + torch.tensor(rise)
+        torch.testing.assert_close(reference.target(s).wrist_p, expected)
+        reference.phase.index.fill_(DESCEND)
+        assert (reference.target(s).wrist_p[:, 2] == expected[0, 2]).all()
 
 
 def test_noise_is_a_function_of_key_and_step_and_looks_uniform():
