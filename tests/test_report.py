@@ -9,12 +9,14 @@ from dora.agents.report import find_runs, tables, write_report
 from dora.errors import InputError
 
 
-def write_run(folder: Path, seed: int, success: float, guidance: str = "affordance", finished: bool = True) -> None:
+def write_run(
+    folder: Path, seed: int, success: float, guidance: str = "affordance", finished: bool = True, **task: object
+) -> None:
     folder.mkdir(parents=True)
     result = {
         "env": "Toy-v1", "agent": "ppo", "guidance": guidance, "seed": seed, "env_steps": 1000, "wall_seconds": 90.0,
         "success_rate": success, "zero_success_rate": 0.5 if guidance == "affordance" else None,
-        "penetration_p95_mm": 2.0, "finished": finished,
+        "penetration_p95_mm": 2.0, "finished": finished, "task": task,
     }  # fmt: skip
     (folder / "result.json").write_text(json.dumps(result))
     head = "env_steps,wall_seconds,success_rate,return_mean,penetration_p95_mm,training_success_rate"
@@ -26,16 +28,21 @@ def test_seeds_of_a_group_make_one_row(tmp_path: Path):
     write_run(tmp_path / "b", 1, 1.0)
     write_run(tmp_path / "c", 0, 0.2, "none")
     write_run(tmp_path / "d", 2, 0.0, finished=False)
+    write_run(tmp_path / "e", 0, 0.4, preset="hard")
+    write_run(tmp_path / "f", 0, 0.3, guidance_parts=["observation", "filter", "prior"])
     rows = tables(find_runs(tmp_path)).splitlines()[2:]
-    assert rows[0].startswith("| Toy-v1 | PPO | affordance | 2 | **95.0 ± 7.1** | 50.0 ± 0.0 |")
-    assert rows[1].startswith("| Toy-v1 | PPO | none | 1 | **20.0** | - |")
-    assert len(rows) == 2
+    assert rows[0].startswith("| Toy-v1 | hard | PPO | affordance | 1 | **40.0** |")
+    assert rows[1].startswith("| Toy-v1 | standard | PPO | affordance | 2 | **95.0 ± 7.1** | 50.0 ± 0.0 |")
+    assert rows[2].startswith("| Toy-v1 | standard | PPO | affordance without reward | 1 | **30.0** |")
+    assert rows[3].startswith("| Toy-v1 | standard | PPO | none | 1 | **20.0** | - |")
+    assert len(rows) == 4
 
 
 def test_a_report_has_a_table_a_page_and_a_figure(tmp_path: Path):
     write_run(tmp_path / "runs" / "a", 0, 0.9)
+    write_run(tmp_path / "runs" / "b", 0, 0.5, preset="hard")
     paths = write_report(tmp_path / "runs", tmp_path / "out")
-    assert {p.name for p in paths} == {"tables.md", "report.html", "Toy-v1.png"}
+    assert {p.name for p in paths} == {"tables.md", "report.html", "Toy-v1.png", "Toy-v1-hard.png"}
     assert all(p.stat().st_size > 100 for p in paths)
     assert "Toy-v1.png" in (tmp_path / "out" / "report.html").read_text()
 

@@ -19,10 +19,18 @@ COLOURS = {
 }
 """Line colour of each learner with and without guidance; others take matplotlib's."""
 CURVE_COLUMNS = ("env_steps", "wall_seconds", "success_rate", "return_mean", "penetration_p95_mm")
+HEADINGS = (
+    "task", "preset", "agent", "guidance", "seeds", "success %", "scripted (zero correction) %", "penetration p95 mm",
+    "steps", "minutes",
+)  # fmt: skip
+"""Of the table."""
 SECONDS_PER_MINUTE = 60.0
 
-Group = tuple[str, str, str]
-"""Environment, agent, guidance."""
+PARTS = ("observation", "reward", "filter", "prior")
+"""What guidance consists of."""
+
+Group = tuple[str, str, str, str]
+"""Environment, preset, agent, guidance: what a row of the table begins with."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +43,12 @@ class Run:
 
     @property
     def group(self) -> Group:
-        """Environment, agent and guidance: runs that differ only in their seed share it."""
-        return self.result["env"], self.result["agent"], self.result["guidance"]
+        """Runs that differ only in their seed share it; guidance names the parts that were left out."""
+        task = self.result.get("task", {})
+        parts = task.get("guidance_parts", PARTS)
+        missing = [part for part in PARTS if part not in parts]
+        guidance = self.result["guidance"] + (f" without {', '.join(missing)}" if missing else "")
+        return self.result["env"], task.get("preset", "standard"), self.result["agent"], guidance
 
 
 def find_runs(root: Path) -> list[Run]:
@@ -70,16 +82,15 @@ def _spread(values: list[float], digits: int = 1) -> str:
 
 
 def tables(runs: list[Run]) -> str:
-    """Markdown: one row per environment, learner and guidance; mean and deviation over seeds."""
+    """Markdown: one row per environment, preset, learner and guidance; mean and deviation over seeds."""
     groups: dict[Group, list[dict]] = defaultdict(list)
     for run in runs:
         groups[run.group].append(run.result)
-    head = "| task | agent | guidance | seeds | success % | zero correction % | penetration p95 mm | steps | minutes |"
-    lines = [head, "|" + " --- |" * 9]
-    for (env, agent, guidance), results in sorted(groups.items()):
+    lines = ["| " + " | ".join(HEADINGS) + " |", "|" + " --- |" * len(HEADINGS)]
+    for (env, preset, agent, guidance), results in sorted(groups.items()):
         zero = [100 * r["zero_success_rate"] for r in results if r["zero_success_rate"] is not None]
         cells = [
-            env, agent.upper(), guidance, str(len(results)),
+            env, preset, agent.upper(), guidance, str(len(results)),
             f"**{_spread([100 * r['success_rate'] for r in results])}**",
             _spread(zero) if zero else "-",
             _spread([r["penetration_p95_mm"] for r in results]),
@@ -90,7 +101,7 @@ def tables(runs: list[Run]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw_curves(runs: list[Run], env: str, path: Path) -> None:
+def draw_curves(runs: list[Run], env: str, preset: str, path: Path) -> None:
     """Success and return over environment steps and minutes, one line per learner: mean and range over seeds."""
     import matplotlib
 
@@ -99,13 +110,13 @@ def draw_curves(runs: list[Run], env: str, path: Path) -> None:
 
     groups: dict[Group, list[Run]] = defaultdict(list)
     for run in runs:
-        if run.result["env"] == env and run.curve:
+        if run.group[:2] == (env, preset) and run.curve:
             groups[run.group].append(run)
     figure, axes = pyplot.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
     steps, minutes = ("env_steps", 1e3), ("wall_seconds", SECONDS_PER_MINUTE)
     views = ((*steps, "success_rate"), (*minutes, "success_rate"), (*steps, "return_mean"))
     for axis, (x, unit, y) in zip(axes, views, strict=True):
-        for (_, agent, guidance), members in sorted(groups.items()):
+        for (_, _, agent, guidance), members in sorted(groups.items()):
             length = min(len(m.curve) for m in members)
             values = [[m.curve[i][y] for m in members] for i in range(length)]
             at = [mean(m.curve[i][x] for m in members) / unit for i in range(length)]
@@ -119,21 +130,21 @@ def draw_curves(runs: list[Run], env: str, path: Path) -> None:
     axes[0].set_ylim(-0.02, 1.02)
     axes[1].set_ylim(-0.02, 1.02)
     axes[0].legend(fontsize=8, loc="lower right")
-    figure.suptitle(f"{env}: greedy evaluation during training (mean and range over seeds)")
+    figure.suptitle(f"{env}, preset {preset}: greedy evaluation during training (mean and range over seeds)")
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
 
 def write_report(root: Path, out: Path) -> list[Path]:
-    """Writes `tables.md`, one figure per environment and `report.html` into `out`; returns their paths."""
+    """Writes `tables.md`, a figure for each task and preset, and `report.html` into `out`; returns their paths."""
     runs = find_runs(root)
     out.mkdir(parents=True, exist_ok=True)
     text = tables(runs)
     write_bytes(out / "tables.md", text.encode())
     figures = []
-    for env in sorted({run.result["env"] for run in runs}):
-        path = out / f"{env}.png"
-        draw_curves(runs, env, path)
+    for env, preset in sorted({run.group[:2] for run in runs}):
+        path = out / (f"{env}.png" if preset == "standard" else f"{env}-{preset}.png")
+        draw_curves(runs, env, preset, path)
         figures.append(path)
     pictures = "".join(f'<p><img src="{html.escape(p.name)}" style="max-width:100%"></p>' for p in figures)
     rows = [line.strip("|").split("|") for line in text.splitlines() if not line.startswith("| ---")]

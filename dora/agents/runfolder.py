@@ -142,6 +142,7 @@ def make_result(
         "finished": finished,
         "eval_episodes": len(some.table) if some else 0,
         "penetration_p95_mm": some.penetration_mm(0.95) if some else None,
+        "task": config.task,
     }
 
 
