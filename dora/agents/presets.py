@@ -49,10 +49,10 @@ PRESETS: dict[tuple[str, str], dict[str, Any]] = {
         "eval_envs": 50,
     },
     ("DoraHammer-v1", "sac"): {
-        "total_steps": 240_000,
+        "total_steps": 300_000,
         "stop_success": 0.97,
         "num_envs": 32,
-        "eval_every": 60_000,
+        "eval_every": 75_000,
         "eval_episodes": 100,
         "eval_envs": 50,
     },

@@ -103,7 +103,7 @@ OBSERVATIONS: dict[str, Entry] = {
 """What the hammer task observes beyond the common entries; the guided ones are the affordance frame."""
 
 
-@register_env("DoraHammer-v1", max_episode_steps=240)
+@register_env("DoraHammer-v1", max_episode_steps=320)
 class HammerEnv(DoraEnv):
     """Catch a falling hammer with the five-fingered hand, bring it over a nail, and drive the nail into its post.
 
@@ -125,7 +125,7 @@ class HammerEnv(DoraEnv):
     PAPER_TERMS = PAPER_TERMS
     EXTRA_OBSERVATIONS = OBSERVATIONS
     DRAWS = 9
-    MAX_STEPS = 240
+    MAX_STEPS = 320
     DEEPEST = DEEPEST
     CONTROL_FREQUENCY = 40
     PHYSICS_FREQUENCY = 240
