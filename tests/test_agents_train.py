@@ -155,7 +155,7 @@ class Slow(PointMass):
         return super().step(action)
 
 
-def test_batches_collected_ahead_are_of_the_policy_before(tmp_path: Path):
+def test_batches_collected_ahead_are_of_the_policy_before():
     learner = PPO(dataclasses.replace(SMALL_PPO, log_std=-3.0), 4, 2, 1000)
     actor: Any = learner.actor
     rollouts = Rollouts(

@@ -33,7 +33,7 @@ def test_seeds_of_a_group_make_one_row(tmp_path: Path):
     rows = tables(find_runs(tmp_path)).splitlines()[2:]
     assert rows[0].startswith("| Toy-v1 | hard | PPO | affordance | 1 | **40.0** |")
     assert rows[1].startswith("| Toy-v1 | standard | PPO | affordance | 2 | **95.0 ± 7.1** | 50.0 ± 0.0 |")
-    assert rows[2].startswith("| Toy-v1 | standard | PPO | affordance without reward | 1 | **30.0** |")
+    assert rows[2].startswith("| Toy-v1 | standard | PPO | affordance (observation, filter, prior) | 1 | **30.0** |")
     assert rows[3].startswith("| Toy-v1 | standard | PPO | none | 1 | **20.0** | - |")
     assert len(rows) == 4
 

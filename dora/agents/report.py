@@ -26,8 +26,8 @@ HEADINGS = (
 """Of the table."""
 SECONDS_PER_MINUTE = 60.0
 
-PARTS = ("observation", "reward", "filter", "prior")
-"""What guidance consists of."""
+DEFAULT_PRESET = "standard"
+"""Preset of a run of a Dora task that names none."""
 
 Group = tuple[str, str, str, str]
 """Environment, preset, agent, guidance: what a row of the table begins with."""
@@ -43,12 +43,11 @@ class Run:
 
     @property
     def group(self) -> Group:
-        """Runs that differ only in their seed share it; guidance names the parts that were left out."""
+        """Runs that differ only in their seed share it; guidance names its parts if the run did."""
         task = self.result.get("task", {})
-        parts = task.get("guidance_parts", PARTS)
-        missing = [part for part in PARTS if part not in parts]
-        guidance = self.result["guidance"] + (f" without {', '.join(missing)}" if missing else "")
-        return self.result["env"], task.get("preset", "standard"), self.result["agent"], guidance
+        parts = task.get("guidance_parts")
+        guidance = self.result["guidance"] + (f" ({', '.join(parts)})" if parts else "")
+        return self.result["env"], task.get("preset", DEFAULT_PRESET), self.result["agent"], guidance
 
 
 def find_runs(root: Path) -> list[Run]:
@@ -143,7 +142,7 @@ def write_report(root: Path, out: Path) -> list[Path]:
     write_bytes(out / "tables.md", text.encode())
     figures = []
     for env, preset in sorted({run.group[:2] for run in runs}):
-        path = out / (f"{env}.png" if preset == "standard" else f"{env}-{preset}.png")
+        path = out / (f"{env}.png" if preset == DEFAULT_PRESET else f"{env}-{preset}.png")
         draw_curves(runs, env, preset, path)
         figures.append(path)
     pictures = "".join(f'<p><img src="{html.escape(p.name)}" style="max-width:100%"></p>' for p in figures)

@@ -91,9 +91,14 @@ def refreshed(page: str, generated: str) -> str:
     return f"{head}{BEGIN}\n\n{generated}\n\n{END}{tail}"
 
 
+def short_name(env_id: str) -> str:
+    """What the files about a Dora id are called: DoraCube-v1 -> cube."""
+    return env_id.removeprefix("Dora").split("-")[0].lower()
+
+
 def page_of(env_id: str, docs: Path) -> Path:
     """Path of the page of a Dora id: DoraCube-v1 -> docs/tasks/cube.md."""
-    return docs / "tasks" / f"{env_id.removeprefix('Dora').split('-')[0].lower()}.md"
+    return docs / "tasks" / f"{short_name(env_id)}.md"
 
 
 def main(docs: Path) -> None:

@@ -113,7 +113,8 @@ class GraspReference(Reference):
         """
         b, phase = self.buffers, self.phase.index
         free = s.goal_p - s.goal_approach * b["standoff"][:, None]
-        free[:, 2] += torch.where(phase == APPROACH, self.hover * rotation_angle(s.goal_q, s.wrist_q), 0.0)
+        if self.hover:
+            free[:, 2] += torch.where(phase == APPROACH, self.hover * rotation_angle(s.goal_q, s.wrist_q), 0.0)
         up = torch.zeros_like(free)
         up[:, 2] = b["raised"]
         latched = (phase >= CLOSE)[:, None]

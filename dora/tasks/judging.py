@@ -100,7 +100,10 @@ class JudgedEnv(BaseEnv):
         return none_left if FILTER in self.parts else torch.zeros_like(none_left)
 
     def evaluate(self) -> dict[str, Tensor]:
-        """Idempotent: reset and wrappers call it too, so it moves nothing."""
+        """Success: all stages done, the episode neither spoiled nor failing now, as a jug that is dropped again does.
+
+        Idempotent: reset and wrappers call it too, so it moves nothing.
+        """
         finished, fail = self.machine.finished, self.failed(self.snapshot) | self.unreachable
         info = {
             "success": finished & ~self.spoiled & ~fail,

@@ -135,24 +135,33 @@ def ranked(candidates: GraspCandidates, proof: Proof) -> GraspCandidates:
 
 
 def usable_in_task(name: str) -> Callable[[GraspCandidates], Bool[Tensor, " c"]] | None:
-    """Which grasps of an object its task can use at all: those within reach from half of some starts.
+    """A function that tells which grasps of an object its task can use at all, f_reach of the task's own.
 
     None where there is no such task, or the object stands on a table, which the search for grasps takes care of.
     """
     if name not in TASKS or name not in OFF_TABLE:
         return None
-    made: list[DoraEnv] = []
+    return _Usable(TASKS[name])
 
-    def usable(candidates: GraspCandidates) -> Bool[Tensor, " c"]:
-        if not made:
-            made.append(make_task(TASKS[name], STARTS, grasps=candidates))
-            made[0].reset(seed=SEED)
-        [task] = made
+
+class _Usable:
+    """Which of c candidates are within reach from at least a share `USABLE` of `STARTS` starts of a task (c,).
+
+    The starts are drawn once, when it is first called; candidates are in the frame of the task's object [m].
+    """
+
+    def __init__(self, env_id: str):
+        self._env_id = env_id
+        self._task: DoraEnv | None = None
+
+    def __call__(self, candidates: GraspCandidates) -> Bool[Tensor, " c"]:
+        if self._task is None:
+            self._task = make_task(self._env_id, STARTS, grasps=candidates)
+            self._task.reset(seed=SEED)
+        task = self._task
         task.guide.choice.candidates = candidates.to(task.device)
         pose = task.target_object.pose
         return (task.reachable(pose.p, pose.q).float().mean(0) >= USABLE).cpu()
-
-    return usable
 
 
 def prove_shipped(name: str, phase: Callable[[str], Callable[[int, int], None]]) -> Path:

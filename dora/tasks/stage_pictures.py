@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from dora.errors import InputError
 from dora.sim.rendering import can_render
 from dora.tasks import make_task, task_ids
+from dora.tasks.document import short_name
 
 SEEDS = range(1, 21)
 """Starts that are tried, in order, until the scripted solution completes all stages (at 0 the jug hides its handle)."""
@@ -78,7 +79,7 @@ def main(docs: Path) -> None:
             raise RuntimeError(
                 f"the scripted solution of {env_id} completed its stages from none of {len(SEEDS)} starts"
             )
-        path = docs / "images" / f"{env_id.removeprefix('Dora').split('-')[0].lower()}-stages.png"
+        path = docs / "images" / f"{short_name(env_id)}-stages.png"
         imageio.imwrite(path, side_by_side(frames))
         print(f"{path}: {env_id}")
 
