@@ -10,11 +10,17 @@ from dora.errors import InputError
 
 
 def write_run(
-    folder: Path, seed: int, success: float, guidance: str = "affordance", finished: bool = True, **task: object
+    folder: Path,
+    seed: int,
+    success: float,
+    guidance: str = "affordance",
+    finished: bool = True,
+    steps: int = 1000,
+    **task: object,
 ) -> None:
     folder.mkdir(parents=True)
     result = {
-        "env": "Toy-v1", "agent": "ppo", "guidance": guidance, "seed": seed, "env_steps": 1000, "wall_seconds": 90.0,
+        "env": "Toy-v1", "agent": "ppo", "guidance": guidance, "seed": seed, "env_steps": steps, "wall_seconds": 90.0,
         "success_rate": success, "zero_success_rate": 0.5 if guidance == "affordance" else None,
         "penetration_p95_mm": 2.0, "finished": finished, "task": task,
     }  # fmt: skip
@@ -30,12 +36,15 @@ def test_seeds_of_a_group_make_one_row(tmp_path: Path):
     write_run(tmp_path / "d", 2, 0.0, finished=False)
     write_run(tmp_path / "e", 0, 0.4, preset="hard")
     write_run(tmp_path / "f", 0, 0.3, guidance_parts=["observation", "filter", "prior"])
+    write_run(tmp_path / "g", 0, 0.7, steps=3000)
     rows = tables(find_runs(tmp_path)).splitlines()[2:]
     assert rows[0].startswith("| Toy-v1 | hard | PPO | affordance | 1 | **40.0** |")
     assert rows[1].startswith("| Toy-v1 | standard | PPO | affordance | 2 | **95.0 ± 7.1** | 50.0 ± 0.0 |")
-    assert rows[2].startswith("| Toy-v1 | standard | PPO | affordance (observation, filter, prior) | 1 | **30.0** |")
-    assert rows[3].startswith("| Toy-v1 | standard | PPO | none | 1 | **20.0** | - |")
-    assert len(rows) == 4
+    assert rows[2].startswith("| Toy-v1 | standard | PPO | affordance | 1 | **70.0** |")
+    assert "| 3k |" in rows[2]
+    assert rows[3].startswith("| Toy-v1 | standard | PPO | affordance (observation, filter, prior) | 1 | **30.0** |")
+    assert rows[4].startswith("| Toy-v1 | standard | PPO | none | 1 | **20.0** | - |")
+    assert len(rows) == 5
 
 
 def test_a_report_has_a_table_a_page_and_a_figure(tmp_path: Path):

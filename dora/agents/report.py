@@ -29,8 +29,8 @@ SECONDS_PER_MINUTE = 60.0
 DEFAULT_PRESET = "standard"
 """Preset of a run of a Dora task that names none."""
 
-Group = tuple[str, str, str, str]
-"""Environment, preset, agent, guidance: what a row of the table begins with."""
+Group = tuple[str, str, str, str, str]
+"""Environment, preset, agent, guidance, steps in thousands: what the runs of one row of the table share."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,8 @@ class Run:
         task = self.result.get("task", {})
         parts = task.get("guidance_parts")
         guidance = self.result["guidance"] + (f" ({', '.join(parts)})" if parts else "")
-        return self.result["env"], task.get("preset", DEFAULT_PRESET), self.result["agent"], guidance
+        steps = f"{self.result['env_steps'] / 1000:.0f}k"
+        return self.result["env"], task.get("preset", DEFAULT_PRESET), self.result["agent"], guidance, steps
 
 
 def find_runs(root: Path) -> list[Run]:
@@ -81,19 +82,19 @@ def _spread(values: list[float], digits: int = 1) -> str:
 
 
 def tables(runs: list[Run]) -> str:
-    """Markdown: one row per environment, preset, learner and guidance; mean and deviation over seeds."""
+    """Markdown: one row per group of runs (`Run.group`), mean and deviation over seeds."""
     groups: dict[Group, list[dict]] = defaultdict(list)
     for run in runs:
         groups[run.group].append(run.result)
     lines = ["| " + " | ".join(HEADINGS) + " |", "|" + " --- |" * len(HEADINGS)]
-    for (env, preset, agent, guidance), results in sorted(groups.items()):
+    for (env, preset, agent, guidance, steps), results in sorted(groups.items()):
         zero = [100 * r["zero_success_rate"] for r in results if r["zero_success_rate"] is not None]
         cells = [
             env, preset, agent.upper(), guidance, str(len(results)),
             f"**{_spread([100 * r['success_rate'] for r in results])}**",
             _spread(zero) if zero else "-",
             _spread([r["penetration_p95_mm"] for r in results]),
-            f"{mean(r['env_steps'] for r in results) / 1000:.0f}k",
+            steps,
             _spread([r["wall_seconds"] / SECONDS_PER_MINUTE for r in results]),
         ]  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
@@ -112,15 +113,15 @@ def draw_curves(runs: list[Run], env: str, preset: str, path: Path) -> None:
         if run.group[:2] == (env, preset) and run.curve:
             groups[run.group].append(run)
     figure, axes = pyplot.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
-    steps, minutes = ("env_steps", 1e3), ("wall_seconds", SECONDS_PER_MINUTE)
-    views = ((*steps, "success_rate"), (*minutes, "success_rate"), (*steps, "return_mean"))
+    by_steps, by_minutes = ("env_steps", 1e3), ("wall_seconds", SECONDS_PER_MINUTE)
+    views = ((*by_steps, "success_rate"), (*by_minutes, "success_rate"), (*by_steps, "return_mean"))
     for axis, (x, unit, y) in zip(axes, views, strict=True):
-        for (_, _, agent, guidance), members in sorted(groups.items()):
+        for (_, _, agent, guidance, steps), members in sorted(groups.items()):
             length = min(len(m.curve) for m in members)
             values = [[m.curve[i][y] for m in members] for i in range(length)]
             at = [mean(m.curve[i][x] for m in members) / unit for i in range(length)]
             colour = COLOURS.get((agent, guidance))
-            label = f"{agent.upper()}, guidance {guidance} ({len(members)})"
+            label = f"{agent.upper()}, guidance {guidance}, {steps} ({len(members)})"
             axis.plot(at, [mean(v) for v in values], color=colour, marker="o", markersize=3, label=label)
             axis.fill_between(at, [min(v) for v in values], [max(v) for v in values], color=colour, alpha=0.15)
         axis.set_xlabel("environment steps [1000]" if x == "env_steps" else "minutes")
