@@ -93,3 +93,20 @@ def test_an_action_asks_for_the_joints_it_was_made_from(task: DoraEnv):
     action = controller.hand_action(joints)
     back = controller.hand_lower + (action / 2 + 0.5) * (controller.hand_upper - controller.hand_lower)
     torch.testing.assert_close(back, joints)
+
+
+def test_no_action_stops_a_wrist_whose_drives_are_told_velocities():
+    task = tasks.make_task("DoraHammer-v1", 1, guidance="none", preset="none")
+    task.reset(seed=0)
+    arm = task.agent.robot._objs[0].active_joints[:7]
+
+    def told() -> float:
+        return max(abs(j.get_drive_velocity_target().item()) for j in arm)
+
+    action = torch.zeros(1, task.action_size)
+    action[:, 2] = 1.0
+    task.step(action)
+    assert told() > 0.1
+    task.step(None)
+    assert told() == 0.0
+    task.close()

@@ -149,6 +149,11 @@ class WristHandController(BaseController):
         self.target = torch.cat([arm, hand], -1)
         self.articulation.set_joint_drive_targets(self.target, self.joints, self.active_joint_indices)
 
+    def hold(self) -> None:
+        """Leaves the commanded joints where they are: drives that are told velocities are told that it is zero."""
+        if self.feed_forward:
+            self._tell_velocity(torch.zeros_like(self.target[:, : self.arm_size]))
+
     def _tell_velocity(self, arm: Float[Tensor, "n 7"]) -> None:
         """Sends velocities [rad/s] to the drives of the arm."""
         self.articulation.set_joint_drive_velocity_targets(

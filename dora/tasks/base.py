@@ -174,6 +174,8 @@ class DoraEnv(BuiltEnv):
         if action is not None:
             self.episode.record_action(action)
             action = self.disturbances.delayed(action, step)
+        elif self.agent.commands_wrist:
+            self.agent.wrist_controller.hold()
         self._push(self.disturbances.pushes(step))
         super()._step_action(None if action is None else self._command(action))
         seen = self.control_freq if self.CONTACT_EVERY_STEP else self.sim_freq
