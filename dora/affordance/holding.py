@@ -17,7 +17,8 @@ from torch import Tensor
 
 from dora.affordance.compiled import CompiledEnergy
 from dora.affordance.hand import HandModel
-from dora.affordance.native.closing import ARM, STIFFNESS, Drives, Model, Ranking, Steps, close_and_load
+from dora.affordance.native.closing import ARM, Drives, Model, Ranking, Steps, close_and_load
+from dora.affordance.native.contact import STIFFNESS
 from dora.affordance.protocol import DIRECTIONS, STANDARD, Protocol
 
 SAFETY = 2.0

@@ -9,30 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dora.affordance.native.compiling import inlined, native
-from dora.affordance.native.field import FieldArrays, coarse, distance_to
-from dora.affordance.native.hand import (
-    SMALL,
-    HandArrays,
-    cross,
-    forward,
-    point_of,
-    pull_back,
-    push,
-    self_penetration,
-    turn,
-)
+from dora.affordance.native.compiling import native
+from dora.affordance.native.contact import STIFFNESS, Contacts, rest_on, touch
+from dora.affordance.native.field import FieldArrays
+from dora.affordance.native.hand import HandArrays, cross, forward, pull_back, push, self_penetration, turn
 
-STIFFNESS = 4e3
-"""Of the contact of one sphere, across and along the surface (N/m); grips overlap by millimetres then."""
 MOMENTUM = 0.7
 """Share of the last step that is added to the next one."""
 LARGEST_STEP = 3e-3
 """Largest step of the object (m, and in units of `ARM` rad)."""
 LARGEST_TURN = 0.05
 """Largest step of a joint (rad)."""
-APPROACH = 6e-3
-"""Distance (m) that a sphere comes nearer to the object in one step at most; those far away wait."""
 ARM = 0.04
 """Typical distance (m) of contacts from the middle of the grip."""
 SPARE = 5.0
@@ -80,17 +67,14 @@ class Model(NamedTuple):
 
 class _State(NamedTuple):
     """Of one candidate: pose of the wrist, joints, their command (rad), force of the weight on the wrist (N), the last
-    step; per sphere its material point in contact, the object's point there, whether it touches, steps to wait."""
+    step, and the contacts with the object."""
 
     wrist: np.ndarray
     joints: np.ndarray
     command: np.ndarray
     weight: np.ndarray
     speed: np.ndarray
-    local: np.ndarray
-    anchor: np.ndarray
-    touching: np.ndarray
-    wait: np.ndarray
+    contacts: Contacts
 
 
 class _Scratch(NamedTuple):
@@ -158,10 +142,9 @@ def _room(spheres, joints, ends):
         np.zeros(joints),
         np.zeros(3),
         np.zeros(6 + joints),
-        np.zeros((spheres, 3)),
-        np.zeros((spheres, 3)),
-        np.zeros(spheres, np.bool_),
-        np.zeros(spheres, np.int64),
+        Contacts(
+            np.zeros((spheres, 3)), np.zeros((spheres, 3)), np.zeros(spheres, np.bool_), np.zeros(spheres, np.int64)
+        ),
     )
     bodies = joints + 1
     scratch = _Scratch(
@@ -182,8 +165,8 @@ def _begin(state, wrist, opened):
     state.command[:] = opened
     state.weight[:] = 0.0
     state.speed[:] = 0.0
-    state.touching[:] = False
-    state.wait[:] = 0
+    state.contacts.touching[:] = False
+    state.contacts.wait[:] = 0
 
 
 @native
@@ -241,8 +224,8 @@ def _relax(model, state, scratch):
     wrench[:] = 0.0
     gradient[:] = 0.0
     if model.plane[3] < np.inf:
-        _rest_on(hand.sphere_body, hand.sphere_local, hand.sphere_radius, model.plane, poses, wrench)
-    total, contacts = _touch(hand, model.field, model.friction, state, poses, wrench)
+        rest_on(hand.sphere_body, hand.sphere_local, hand.sphere_radius, model.plane, poses, wrench)
+    total, contacts = touch(hand, model.field, model.friction, state.contacts, poses, wrench)
     self_penetration(hand, 0.0, STIFFNESS, poses, scratch.ends, wrench)
     push(wrench, 0, (0.0, 0.0, 0.0), state.weight)
     pull_back(hand, poses, wrench, gradient)
@@ -254,86 +237,6 @@ def _relax(model, state, scratch):
         joints[j] = min(max(joints[j] + step, hand.lower[j]), hand.upper[j])
     _move(state.wrist, model.center, (SPARE + contacts) * STIFFNESS, gradient, speed)
     return total
-
-
-@native
-def _touch(hand, field, friction, state, poses, wrench):
-    """Contacts of all spheres with the object: their forces go to the wrench; returns the sum of normal forces (N) and
-    the number of contacts."""
-    body_of, centers, radii, wait, touching = (
-        hand.sphere_body,
-        hand.sphere_local,
-        hand.sphere_radius,
-        state.wait,
-        state.touching,
-    )
-    total, contacts = 0.0, 0
-    for s in range(len(body_of)):
-        if wait[s] > 0:
-            wait[s] -= 1
-            continue
-        body, radius = body_of[s], radii[s]
-        point = point_of(poses, body, centers, s)
-        beyond = coarse(field, point) - radius - field.cull
-        if beyond > 0.0:
-            touching[s] = False
-            wait[s] = int(beyond / APPROACH)
-            continue
-        value, slope = distance_to(field, point)
-        depth = radius - value
-        if depth <= 0.0:
-            touching[s] = False
-            continue
-        length = max(math.sqrt(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2), SMALL)
-        n = (slope[0] / length, slope[1] / length, slope[2] / length)
-        if not touching[s]:
-            touching[s] = True
-            _hold_on(poses, body, point, n, radius, state.local, state.anchor, s)
-        _push_out(poses, body, s, n, STIFFNESS * depth, friction, state.local, state.anchor, wrench)
-        total += STIFFNESS * depth
-        contacts += 1
-    return total, contacts
-
-
-@inlined
-def _push_out(poses, body, s, n, normal, friction, local, anchor, wrench):
-    """A contact's normal force (N) and Coulomb friction, whose anchor follows when it slides."""
-    here = point_of(poses, body, local, s)
-    slip = (here[0] - anchor[s, 0], here[1] - anchor[s, 1], here[2] - anchor[s, 2])
-    along = slip[0] * n[0] + slip[1] * n[1] + slip[2] * n[2]
-    t = (slip[0] - along * n[0], slip[1] - along * n[1], slip[2] - along * n[2])
-    size = STIFFNESS * math.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
-    share = 1.0
-    if size > friction * normal:
-        share = friction * normal / size
-        for i in range(3):
-            anchor[s, i] = here[i] - share * t[i]
-    k = share * STIFFNESS
-    push(wrench, body, here, (k * t[0] - normal * n[0], k * t[1] - normal * n[1], k * t[2] - normal * n[2]))
-
-
-@native
-def _rest_on(body_of, centers, radius, plane, poses, wrench):
-    """The table pushes spheres out."""
-    nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
-    for s in range(len(body_of)):
-        body = body_of[s]
-        point = point_of(poses, body, centers, s)
-        depth = radius[s] - (nx * point[0] + ny * point[1] + nz * point[2] + offset)
-        if depth > 0.0:
-            k = -STIFFNESS * depth
-            push(wrench, body, point, (k * nx, k * ny, k * nz))
-
-
-@inlined
-def _hold_on(poses, body, point, n, radius, local, anchor, s):
-    """A sphere begins to touch: its material point and the object's point there."""
-    for i in range(3):
-        anchor[s, i] = point[i] - radius * n[i]
-    for k in range(3):
-        local[s, k] = 0.0
-        for i in range(3):
-            local[s, k] += poses[body, i, k] * (anchor[s, i] - poses[body, i, 3])
 
 
 @native
