@@ -19,6 +19,7 @@ import tyro
 
 from dora.agents.checkpoint import read_checkpoint
 from dora.agents.config import RunConfig
+from dora.agents.evaluate import outcome
 from dora.agents.play import checkpoint_path, evaluate_checkpoint, load_policy, record
 from dora.agents.presets import recommended, with_total_steps
 from dora.agents.runfolder import RunFolder, make_result
@@ -166,7 +167,9 @@ def evaluate_only(args: Args) -> Path:
     )  # fmt: skip
     check_task_id(config.env)
     make_task_batch = functools.partial(make_task, config.env, guidance=config.guidance, **config.task)
+    print(f"evaluation on {config.final_episodes} episodes ...", file=sys.stderr)
     checkpoint, evaluation, zero = evaluate_checkpoint(path, config, make_task_batch)
+    print(outcome(evaluation, zero), file=sys.stderr)
     folder = RunFolder(args.out or default_folder(config, "-eval"))
     folder.create(config)
     folder.write_evaluation(evaluation)

@@ -1,14 +1,20 @@
 """The run command refuses bad input with one sentence and exit status 2."""
 
+import json
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 from commands import call, load_command
 
+from dora.agents.checkpoint import read_checkpoint
 from dora.agents.config import LEARNER_CONFIGS
+from dora.agents.play import load_policy
 from dora.agents.presets import PRESETS, recommended
 from dora.agents.runfolder import RunFolder
+
+SHIPPED = sorted((Path(__file__).parents[1] / "results").rglob("policy.safetensors"))
+"""Policies of the results that the README shows."""
 
 
 @pytest.fixture(scope="module")
@@ -69,3 +75,26 @@ def test_a_bare_command_takes_the_learner_recommended_for_the_task():
         assert isinstance(config.learner, LEARNER_CONFIGS[config.agent])
     assert chosen["DoraJug-v1"].total_steps == PRESETS["DoraJug-v1", "sac"]["total_steps"]
     assert recommended("DoraJug-v1", "ppo").agent == "ppo"
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parts[-3]}/{path.parts[-2]}")
+def test_a_shipped_policy_is_that_of_the_result_beside_it(path: Path):
+    checkpoint, result = read_checkpoint(path), json.loads((path.parent / "result.json").read_text())
+    load_policy(checkpoint, path)
+    assert (checkpoint.config.env, checkpoint.config.seed) == (result["env"], result["seed"])
+    assert checkpoint.config.task.get("preset") == result.get("task", {}).get("preset")
+    assert checkpoint.config.digest() == result["config_digest"]
+
+
+def test_a_shipped_policy_can_be_evaluated_alone(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    policy = next(path for path in SHIPPED if "DoraCube-v1" in path.parts)
+    arguments = f"--eval-only --checkpoint {policy} --episodes 4 --preset none --out {tmp_path / 'eval'}"
+    assert call(script, monkeypatch, *arguments.split()) == 0
+    captured = capsys.readouterr()
+    assert captured.out == f"{tmp_path / 'eval'}\n"
+    assert "evaluation on 4 episodes" in captured.err
+    assert "success 1.000, without any correction 1.000" in captured.err
+    result = json.loads((tmp_path / "eval" / "result.json").read_text())
+    assert (result["success_rate"], result["eval_episodes"], result["task"]) == (1.0, 4, {"preset": "none"})

@@ -93,11 +93,10 @@ def run_batch(env: TaskEnv, act: Act, first_seed: int) -> Float[Tensor, "n k"]:
     return table
 
 
-def evaluate(env: TaskEnv, act: Act, episodes: int, first_seed: int) -> Evaluation:
-    """Run `episodes` episodes with seeds first_seed, first_seed + 1, ...
-
-    Episode i has the same seed whatever the number of environments.
-    """
-    starts = range(0, episodes, env.batch_size[0])
-    tables = [run_batch(env, act, first_seed + start) for start in starts]
-    return Evaluation(env.columns, torch.cat(tables)[:episodes])
+def outcome(evaluation: Evaluation, zero: Evaluation | None) -> str:
+    """What is told of a policy's last evaluation, and of no correction's if there is a prior, in one line."""
+    text = f"success {evaluation.success_rate:.3f}"
+    if zero is not None:
+        text += f", without any correction {zero.success_rate:.3f}"
+    depth = evaluation.penetration_mm(0.95)
+    return text + (f", penetration p95 {depth:.1f} mm" if depth is not None else "")

@@ -13,7 +13,7 @@ from torch import Tensor
 from dora.agents.collect import sigint_blocked
 from dora.agents.config import RunConfig
 from dora.agents.env import TaskEnv, TaskFactory
-from dora.agents.evaluate import Act, Evaluation, no_correction, run_batch
+from dora.agents.evaluate import FINAL_SEED, Act, Evaluation, no_correction, run_batch
 from dora.agents.learner import make_learner
 from dora.agents.networks import Policy
 from dora.errors import InputError
@@ -44,7 +44,7 @@ class Evaluators:
     """
 
     def __init__(self, make_task: TaskFactory, config: RunConfig):
-        self.env = TaskEnv(make_task())
+        self.env, self._config = TaskEnv(make_task()), config
         self.sizes = (
             self.env.observation_spec["observation"].shape[-1],
             self.env.action_spec.shape[-1],
@@ -86,6 +86,13 @@ class Evaluators:
         return Evaluation(
             self.env.columns, torch.from_numpy(np.concatenate([tables[start] for start in starts])[:episodes])
         )
+
+    def final(self, policy: Policy, check: Callable[[], None] = lambda: None) -> tuple[Evaluation, Evaluation | None]:
+        """Evaluate a policy, and no correction if there is a prior, on `config.final_episodes` seeds that chose
+        nothing; arguments and errors as for `run`."""
+        episodes = self._config.final_episodes
+        evaluation = self.run(policy, episodes, FINAL_SEED, check)
+        return evaluation, self.run(None, episodes, FINAL_SEED, check) if self._config.has_prior else None
 
     def close(self) -> None:
         """End the helpers and close the environments."""

@@ -1,5 +1,6 @@
 """A trained policy at work: evaluation of a checkpoint, and films."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,9 @@ from torch import Tensor
 
 from dora.agents.checkpoint import Checkpoint, check_belongs, read_checkpoint, unpack_modules
 from dora.agents.config import RunConfig
-from dora.agents.env import Task, TaskEnv
-from dora.agents.evaluate import FINAL_SEED, Act, Evaluation, evaluate, no_correction
+from dora.agents.env import Task
+from dora.agents.evaluate import FINAL_SEED, Act, Evaluation
+from dora.agents.evaluators import Evaluators
 from dora.agents.learner import make_learner
 from dora.agents.networks import Policy
 from dora.agents.trainer import MakeTask
@@ -46,19 +48,12 @@ def evaluate_checkpoint(
         InputError: if it is no checkpoint or belongs to another task, learner or guidance.
     """
     checkpoint = read_checkpoint(path)
-    env = TaskEnv(make_task(config.eval_envs))
+    evaluators = Evaluators(functools.partial(make_task, config.eval_envs), config)
     try:
-        action_size = env.action_spec.shape[-1]
-        sizes = (env.observation_spec["observation"].shape[-1], action_size)
-        check_belongs(checkpoint, path, config, sizes, exactly=False)
-        policy = load_policy(checkpoint, path)
-        evaluation = evaluate(env, policy.greedy, config.final_episodes, FINAL_SEED)
-        zero = None
-        if config.has_prior:
-            zero = evaluate(env, no_correction(action_size), config.final_episodes, FINAL_SEED)
-        return checkpoint, evaluation, zero
+        check_belongs(checkpoint, path, config, evaluators.sizes, exactly=False)
+        return checkpoint, *evaluators.final(load_policy(checkpoint, path))
     finally:
-        env.close()
+        evaluators.close()
 
 
 def record(make_task: Callable[[], Task], act: Act, path: Path, episodes: int) -> None:

@@ -25,7 +25,7 @@ from dora.agents.checkpoint import (
 from dora.agents.collect import Rollouts
 from dora.agents.config import RunConfig
 from dora.agents.env import EpisodeColumns, Task, ended_episodes
-from dora.agents.evaluate import FINAL_SEED, PERIODIC_SEED, Evaluation
+from dora.agents.evaluate import PERIODIC_SEED, Evaluation, outcome
 from dora.agents.evaluators import Evaluators
 from dora.agents.interrupt import Interrupt
 from dora.agents.learner import Learner, make_learner
@@ -107,7 +107,7 @@ class Trainer:
                 self.save()
                 progress.say(f"last evaluation of the best policy, on {self.config.final_episodes} episodes ...")
                 evaluation, zero = self._final_evaluation(interrupt)
-                progress.say(_outcome(evaluation, zero))
+                progress.say(outcome(evaluation, zero))
                 finished = True
             except KeyboardInterrupt:
                 self.save()
@@ -244,11 +244,7 @@ class Trainer:
             unpack_modules(self.learner.policy.modules_by_name, best.tensors, self.folder.best)
         else:
             self._keep_as_best()
-        episodes = self.config.final_episodes
-        evaluation = self._evaluators.run(self.learner.policy, episodes, FINAL_SEED, interrupt.check)
-        zero = None
-        if self.config.has_prior:
-            zero = self._evaluators.run(None, episodes, FINAL_SEED, interrupt.check)
+        evaluation, zero = self._evaluators.final(self.learner.policy, interrupt.check)
         self._spend("evaluate", time.perf_counter() - start)
         return evaluation, zero
 
@@ -282,15 +278,6 @@ class Trainer:
         if self.learner.replay is not None:
             self.learner.replay.load(self.folder.replay)
         self._resumed = checkpoint.tensors
-
-
-def _outcome(evaluation: Evaluation, zero: Evaluation | None) -> str:
-    """What a run tells in the end."""
-    text = f"success {evaluation.success_rate:.3f}"
-    if zero is not None:
-        text += f", without any correction {zero.success_rate:.3f}"
-    depth = evaluation.penetration_mm(0.95)
-    return text + (f", penetration p95 {depth:.1f} mm" if depth is not None else "")
 
 
 def _or_nan(value: float | None) -> float:
