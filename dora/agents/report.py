@@ -102,7 +102,8 @@ def tables(runs: list[Run]) -> str:
 
 
 def draw_curves(runs: list[Run], env: str, preset: str, path: Path) -> None:
-    """Success and return over environment steps and minutes, one line per learner: mean and range over seeds."""
+    """Success and return over environment steps and minutes, one line per learner: mean and range over seeds;
+    dotted, the success of no correction in the last evaluations."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -124,12 +125,15 @@ def draw_curves(runs: list[Run], env: str, preset: str, path: Path) -> None:
             label = f"{agent.upper()}, guidance {guidance}, {steps} ({len(members)})"
             axis.plot(at, [mean(v) for v in values], color=colour, marker="o", markersize=3, label=label)
             axis.fill_between(at, [min(v) for v in values], [max(v) for v in values], color=colour, alpha=0.15)
+            zero = [m.result["zero_success_rate"] for m in members if m.result["zero_success_rate"] is not None]
+            if zero and y == "success_rate":
+                axis.axhline(mean(zero), color=colour, linestyle=":", label="the same without any correction")
         axis.set_xlabel("environment steps [1000]" if x == "env_steps" else "minutes")
         axis.set_ylabel(y.replace("_", " "))
         axis.grid(alpha=0.3)
     axes[0].set_ylim(-0.02, 1.02)
     axes[1].set_ylim(-0.02, 1.02)
-    axes[0].legend(fontsize=8, loc="lower right")
+    axes[0].legend(fontsize=8, loc="best")
     figure.suptitle(f"{env}, preset {preset}: greedy evaluation during training (mean and range over seeds)")
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
