@@ -113,7 +113,7 @@ def draw_curves(runs: list[Run], env: str, preset: str, path: Path) -> None:
     for run in runs:
         if run.group[:2] == (env, preset) and run.curve:
             groups[run.group].append(run)
-    figure, axes = pyplot.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
+    figure, axes = pyplot.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
     by_steps, by_minutes = ("env_steps", 1e3), ("wall_seconds", SECONDS_PER_MINUTE)
     views = ((*by_steps, "success_rate"), (*by_minutes, "success_rate"), (*by_steps, "return_mean"))
     for axis, (x, unit, y) in zip(axes, views, strict=True):
@@ -123,18 +123,20 @@ def draw_curves(runs: list[Run], env: str, preset: str, path: Path) -> None:
             at = [mean(m.curve[i][x] for m in members) / unit for i in range(length)]
             colour = COLOURS.get((agent, guidance))
             label = f"{agent.upper()}, guidance {guidance}, {steps} ({len(members)})"
-            axis.plot(at, [mean(v) for v in values], color=colour, marker="o", markersize=3, label=label)
+            (line,) = axis.plot(at, [mean(v) for v in values], color=colour, marker="o", markersize=3, label=label)
+            colour = line.get_color()
             axis.fill_between(at, [min(v) for v in values], [max(v) for v in values], color=colour, alpha=0.15)
             zero = [m.result["zero_success_rate"] for m in members if m.result["zero_success_rate"] is not None]
             if zero and y == "success_rate":
-                axis.axhline(mean(zero), color=colour, linestyle=":", label="the same without any correction")
+                axis.axhline(mean(zero), color=colour, linestyle=":")
         axis.set_xlabel("environment steps [1000]" if x == "env_steps" else "minutes")
         axis.set_ylabel(y.replace("_", " "))
         axis.grid(alpha=0.3)
     axes[0].set_ylim(-0.02, 1.02)
     axes[1].set_ylim(-0.02, 1.02)
-    axes[0].legend(fontsize=8, loc="best")
-    figure.suptitle(f"{env}, preset {preset}: greedy evaluation during training (mean and range over seeds)")
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=2)
+    about = "greedy evaluation during training (mean and range over seeds; dotted: no correction)"
+    figure.suptitle(f"{env}, preset {preset}: {about}")
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
