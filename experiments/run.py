@@ -162,7 +162,8 @@ def evaluate_only(args: Args) -> Path:
     theirs = read_checkpoint(path).config
     asked = {"agent": args.agent or theirs.agent, "guidance": args.guidance or theirs.guidance}
     config = recommended(
-        args.env or theirs.env, **asked, seed=theirs.seed, num_envs=theirs.num_envs, workers=theirs.workers,
+        args.env or theirs.env, **asked, seed=theirs.seed, num_envs=theirs.num_envs,
+        workers=theirs.workers if args.workers is None else args.workers,
         final_episodes=args.episodes, total_steps=theirs.total_steps, task=theirs.task | task_options(args),
     )  # fmt: skip
     check_task_id(config.env)

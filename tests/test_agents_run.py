@@ -90,7 +90,7 @@ def test_a_shipped_policy_can_be_evaluated_alone(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     policy = next(path for path in SHIPPED if "DoraCube-v1" in path.parts)
-    arguments = f"--eval-only --checkpoint {policy} --episodes 4 --preset none --out {tmp_path / 'eval'}"
+    arguments = f"--eval-only --checkpoint {policy} --episodes 4 --workers 1 --preset none --out {tmp_path / 'eval'}"
     assert call(script, monkeypatch, *arguments.split()) == 0
     captured = capsys.readouterr()
     assert captured.out == f"{tmp_path / 'eval'}\n"
@@ -98,3 +98,4 @@ def test_a_shipped_policy_can_be_evaluated_alone(
     assert "success 1.000, without any correction 1.000" in captured.err
     result = json.loads((tmp_path / "eval" / "result.json").read_text())
     assert (result["success_rate"], result["eval_episodes"], result["task"]) == (1.0, 4, {"preset": "none"})
+    assert result["workers"] == 1

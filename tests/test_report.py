@@ -36,12 +36,12 @@ def test_seeds_of_a_group_make_one_row(tmp_path: Path):
     write_run(tmp_path / "d", 2, 0.0, finished=False)
     write_run(tmp_path / "e", 0, 0.4, preset="hard")
     write_run(tmp_path / "f", 0, 0.3, guidance_parts=["observation", "filter", "prior"])
-    write_run(tmp_path / "g", 0, 0.7, steps=3000)
+    write_run(tmp_path / "g", 0, 0.7, steps=10_000)
     rows = tables(find_runs(tmp_path)).splitlines()[2:]
     assert rows[0].startswith("| Toy-v1 | hard | PPO | affordance | 1 | **40.0** |")
     assert rows[1].startswith("| Toy-v1 | standard | PPO | affordance | 2 | **95.0 ± 7.1** | 50.0 ± 0.0 |")
     assert rows[2].startswith("| Toy-v1 | standard | PPO | affordance | 1 | **70.0** |")
-    assert "| 3k |" in rows[2]
+    assert "| 10k |" in rows[2]
     assert rows[3].startswith("| Toy-v1 | standard | PPO | affordance (observation, filter, prior) | 1 | **30.0** |")
     assert rows[4].startswith("| Toy-v1 | standard | PPO | none | 1 | **20.0** | - |")
     assert len(rows) == 5
@@ -50,6 +50,7 @@ def test_seeds_of_a_group_make_one_row(tmp_path: Path):
 def test_a_report_has_a_table_a_page_and_a_figure(tmp_path: Path):
     write_run(tmp_path / "runs" / "a", 0, 0.9)
     write_run(tmp_path / "runs" / "b", 0, 0.5, preset="hard")
+    write_run(tmp_path / "runs" / "c", 0, 0.1, guidance="none")
     paths = write_report(tmp_path / "runs", tmp_path / "out")
     assert {p.name for p in paths} == {"tables.md", "report.html", "Toy-v1.png", "Toy-v1-hard.png"}
     assert all(p.stat().st_size > 100 for p in paths)

@@ -67,6 +67,11 @@ class Evaluation:
             return None
         return float(self.values("penetration_mm").quantile(quantile))
 
+    @property
+    def penetration_p95_mm(self) -> float | None:
+        """95th percentile over the episodes of their deepest penetration, mm; None if the task reports none."""
+        return self.penetration_mm(0.95)
+
     def rows(self) -> tuple[tuple[str, ...], list[list[Any]]]:
         """Header and rows of `eval.csv`: episode number, then every column."""
         names = tuple(n for n in self.columns.names if n != "whole")
@@ -98,5 +103,5 @@ def outcome(evaluation: Evaluation, zero: Evaluation | None) -> str:
     text = f"success {evaluation.success_rate:.3f}"
     if zero is not None:
         text += f", without any correction {zero.success_rate:.3f}"
-    depth = evaluation.penetration_mm(0.95)
+    depth = evaluation.penetration_p95_mm
     return text + (f", penetration p95 {depth:.1f} mm" if depth is not None else "")

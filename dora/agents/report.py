@@ -29,8 +29,8 @@ SECONDS_PER_MINUTE = 60.0
 DEFAULT_PRESET = "standard"
 """Preset of a run of a Dora task that names none."""
 
-Group = tuple[str, str, str, str, str]
-"""Environment, preset, agent, guidance, steps in thousands: what the runs of one row of the table share."""
+Group = tuple[str, str, str, str, int]
+"""Environment, preset, agent, guidance, steps in thousands (rounded): what the runs of one row of the table share."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Run:
         task = self.result.get("task", {})
         parts = task.get("guidance_parts")
         guidance = self.result["guidance"] + (f" ({', '.join(parts)})" if parts else "")
-        steps = f"{self.result['env_steps'] / 1000:.0f}k"
-        return self.result["env"], task.get("preset", DEFAULT_PRESET), self.result["agent"], guidance, steps
+        thousands = round(self.result["env_steps"] / 1000)
+        return self.result["env"], task.get("preset", DEFAULT_PRESET), self.result["agent"], guidance, thousands
 
 
 def find_runs(root: Path) -> list[Run]:
@@ -81,20 +81,25 @@ def _spread(values: list[float], digits: int = 1) -> str:
     return f"{mean(values):.{digits}f}{deviation}"
 
 
+def _zero_rates(results: list[dict]) -> list[float]:
+    """Success of no correction in the runs that have a prior."""
+    return [r["zero_success_rate"] for r in results if r["zero_success_rate"] is not None]
+
+
 def tables(runs: list[Run]) -> str:
     """Markdown: one row per group of runs (`Run.group`), mean and deviation over seeds."""
     groups: dict[Group, list[dict]] = defaultdict(list)
     for run in runs:
         groups[run.group].append(run.result)
     lines = ["| " + " | ".join(HEADINGS) + " |", "|" + " --- |" * len(HEADINGS)]
-    for (env, preset, agent, guidance, steps), results in sorted(groups.items()):
-        zero = [100 * r["zero_success_rate"] for r in results if r["zero_success_rate"] is not None]
+    for (env, preset, agent, guidance, thousands), results in sorted(groups.items()):
+        zero = [100 * rate for rate in _zero_rates(results)]
         cells = [
             env, preset, agent.upper(), guidance, str(len(results)),
             f"**{_spread([100 * r['success_rate'] for r in results])}**",
             _spread(zero) if zero else "-",
             _spread([r["penetration_p95_mm"] for r in results]),
-            steps,
+            f"{thousands}k",
             _spread([r["wall_seconds"] / SECONDS_PER_MINUTE for r in results]),
         ]  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
@@ -117,16 +122,16 @@ def draw_curves(runs: list[Run], env: str, preset: str, path: Path) -> None:
     by_steps, by_minutes = ("env_steps", 1e3), ("wall_seconds", SECONDS_PER_MINUTE)
     views = ((*by_steps, "success_rate"), (*by_minutes, "success_rate"), (*by_steps, "return_mean"))
     for axis, (x, unit, y) in zip(axes, views, strict=True):
-        for (_, _, agent, guidance, steps), members in sorted(groups.items()):
+        for (_, _, agent, guidance, thousands), members in sorted(groups.items()):
             length = min(len(m.curve) for m in members)
             values = [[m.curve[i][y] for m in members] for i in range(length)]
             at = [mean(m.curve[i][x] for m in members) / unit for i in range(length)]
             colour = COLOURS.get((agent, guidance))
-            label = f"{agent.upper()}, guidance {guidance}, {steps} ({len(members)})"
+            label = f"{agent.upper()}, guidance {guidance}, {thousands}k ({len(members)})"
             (line,) = axis.plot(at, [mean(v) for v in values], color=colour, marker="o", markersize=3, label=label)
             colour = line.get_color()
             axis.fill_between(at, [min(v) for v in values], [max(v) for v in values], color=colour, alpha=0.15)
-            zero = [m.result["zero_success_rate"] for m in members if m.result["zero_success_rate"] is not None]
+            zero = _zero_rates([m.result for m in members])
             if zero and y == "success_rate":
                 axis.axhline(mean(zero), color=colour, linestyle=":")
         axis.set_xlabel("environment steps [1000]" if x == "env_steps" else "minutes")

@@ -141,7 +141,7 @@ def make_result(
         "config_digest": config.digest(),
         "finished": finished,
         "eval_episodes": len(some.table) if some else 0,
-        "penetration_p95_mm": some.penetration_mm(0.95) if some else None,
+        "penetration_p95_mm": some.penetration_p95_mm if some else None,
         "task": config.task,
     }
 

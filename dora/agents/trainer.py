@@ -212,7 +212,7 @@ class Trainer:
             counters.next_evaluation += config.eval_every
         self._last_evaluation = evaluation
         success, mean_return = evaluation.success_rate, evaluation.return_mean
-        depth = evaluation.penetration_mm(0.95)
+        depth = evaluation.penetration_p95_mm
         log.add("evaluation", {"success_rate": success, "return_mean": mean_return}, counters.env_steps)
         log.add("evaluation/stage", evaluation.stage_rates, counters.env_steps)
         if depth is not None:

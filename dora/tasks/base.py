@@ -171,13 +171,15 @@ class DoraEnv(BuiltEnv):
 
     def _step_action(self, action: Any) -> Any:
         action, step = self._checked(action), self._elapsed_steps
+        command = None
         if action is not None:
             self.episode.record_action(action)
             action = self.disturbances.delayed(action, step)
+            command = self._command(action)
         elif self.agent.commands_wrist:
             self.agent.wrist_controller.hold()
         self._push(self.disturbances.pushes(step))
-        super()._step_action(None if action is None else self._command(action))
+        super()._step_action(command)
         seen = self.control_freq if self.CONTACT_EVERY_STEP else self.sim_freq
         self.episode.record_contacts(self._reader.contacts(), seen)
         if self.CONTACT_POINTS:
