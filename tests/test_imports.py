@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-LEVELS = {"errors": 0, "files": 0, "progress": 0, "robot": 1, "affordance": 2, "sim": 3, "tasks": 4}
+LEVELS = {"digests": 0, "errors": 0, "files": 0, "progress": 0, "robot": 1, "affordance": 2, "sim": 3, "tasks": 4}
 """A package may import packages of its own level or below."""
 FORBIDDEN = {
     "robot": ("sapien", "mani_skill", "torchrl"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from dora.affordance import servo
+from dora.affordance import inverse_kinematics, servo
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.collision import CollisionModel
 from dora.affordance.extent import ArmExtent, HandExtent
@@ -385,10 +385,27 @@ def test_a_grid_without_places_is_refused():
         Grid((0.0, 0.0), (0.1, 0.1), spacing=0.0)
 
 
-def test_the_servo_has_the_numbers_of_the_tasks():
-    """`dora.affordance` may not import the tasks, so the numbers stand in both."""
-    assert 1 / servo.PERIOD == BuiltEnv.CONTROL_FREQUENCY
-    assert (servo.WRIST_SPEED, servo.WRIST_SPIN) == (controllers.WRIST_SPEED, controllers.WRIST_SPIN)
+def test_the_filter_has_the_numbers_of_the_tasks():
+    """`dora.affordance` may not import the tasks, so some numbers stand in both."""
+    ours = servo.Controller()
+    assert 1 / ours.period == BuiltEnv.CONTROL_FREQUENCY
+    assert (ours.speed, ours.spin) == (controllers.WRIST_SPEED, controllers.WRIST_SPIN)
     assert servo.LIMIT_MARGIN == controllers.LIMIT_MARGIN
-    assert (servo.DESCENT, servo.ARRIVED) == (guidance.DESCENT, guidance.ARRIVED)
-    assert tuple(x / 2 for x in guidance.SETTLED) == servo.SETTLED
+    assert (ours.descent * ours.period, ours.arrived) == (guidance.DESCENT, guidance.ARRIVED)
+    assert tuple(x / 2 for x in guidance.SETTLED) == ours.settled
+
+
+@pytest.mark.parametrize("change", ["controller", "kinematics"])
+def test_a_table_is_made_anew_when_a_number_changes_on_which_motions_depend(robot, monkeypatch, change):
+    cube, candidates, grid = load_object("cube"), grasps(robot, load_object("cube"), 4), Grid((0.5, 0.0), (0.0, 0.0))
+
+    def digest(**numbers):
+        reach = Reach(robot, cube, settings=ReachSettings(controller=servo.Controller(**numbers)))
+        return table_digest(reach, candidates, grid, cube.support, cube.rest)
+
+    before, numbers = digest(), {}
+    if change == "controller":
+        numbers = {"speed": 0.5}
+    else:
+        monkeypatch.setitem(inverse_kinematics.NUMBERS, "largest_step", 0.5)
+    assert digest(**numbers) != before

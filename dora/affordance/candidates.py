@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -14,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dora.affordance.structure import AffordanceObject
+from dora.digests import digest_of
 from dora.errors import InputError
 from dora.files import read_tensors, write_tensors
 from dora.robot import RobotDescription
@@ -239,14 +239,18 @@ def hand_digest(robot: RobotDescription) -> str:
     """sha256 of what a stored grasp depends on: joints, limits and couplings of the hand, and the tree and
     collision shapes of the links that move with the wrist. Gains and the arm do not count."""
     joints = [joint for joint in robot.model.joints.values() if _carried(robot, joint.child)]
-    digest = hashlib.sha256()
-    for joint in sorted(joints, key=lambda joint: joint.name):
-        digest.update(f"{joint.name} {joint.kind} {joint.parent} {joint.child}".encode())
-        digest.update(np.round([*joint.origin.ravel(), *joint.axis, joint.lower, joint.upper], DIGITS).tobytes())
     links = sorted({robot.wrist_link} | {joint.child for joint in joints})
-    digest.update(repr([(link, robot.shapes.get(link, ())) for link in links]).encode())
-    digest.update(repr((robot.hand.names, robot.couplings)).encode())
-    return digest.hexdigest()
+    tree = {
+        joint.name: {
+            "kind": joint.kind,
+            "parent": joint.parent,
+            "child": joint.child,
+            "numbers": np.round([*joint.origin.ravel(), *joint.axis, joint.lower, joint.upper], DIGITS),
+        }
+        for joint in joints
+    }
+    shapes = {link: robot.shapes.get(link, ()) for link in links}
+    return digest_of({"joints": tree, "shapes": shapes, "order": robot.hand.names, "couplings": robot.couplings})
 
 
 def _carried(robot: RobotDescription, link: str) -> bool:

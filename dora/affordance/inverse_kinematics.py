@@ -22,7 +22,7 @@ from torch import Tensor
 
 from dora.errors import InputError
 from dora.robot import RobotDescription, SerialChain
-from dora.robot.kinematics import Frames
+from dora.robot.kinematics import DAMPING, Frames
 from dora.robot.rotations import matrix_from_quaternion
 
 POSITION_TOLERANCE = 2e-4
@@ -59,6 +59,20 @@ MANIPULABILITY_COST = 1.0
 """Cost of a singular posture, in radians of distance from the start posture."""
 LAST = 1e3
 """More than any solution's cost [rad]: puts what is not solved last."""
+NUMBERS = {
+    "position_tolerance": POSITION_TOLERANCE,
+    "angle_tolerance": ANGLE_TOLERANCE,
+    "limit_margin": LIMIT_MARGIN,
+    "damping": (DAMPING_FLOOR, DAMPING_GAIN),
+    "largest_step": LARGEST_STEP,
+    "pull": (PULLED, PULL),
+    "metres_per_radian": (METRES_PER_RADIAN, METRES_PER_JOINT_RADIAN),
+    "table_size": TABLE_SIZE,
+    "margin": (MARGIN_SCALE, MARGIN_COST),
+    "manipulability": (MANIPULABILITY_SCALE, MANIPULABILITY_COST),
+    "step_damping": DAMPING,
+}
+"""All that solutions depend on besides the robot, for digests of what is stored."""
 
 
 @dataclass(frozen=True, eq=False)

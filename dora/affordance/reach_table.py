@@ -6,7 +6,6 @@ these; a reset then costs one look-up. A table is kept on disk under a digest of
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,11 +15,13 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from dora.affordance import inverse_kinematics
 from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.decomposition import cache_folder
 from dora.affordance.reach import Reach
 from dora.affordance.shipped import data_folder
 from dora.affordance.ways import OK
+from dora.digests import digest_of
 from dora.errors import InputError
 from dora.files import read_tensors, write_tensors
 from dora.robot.rotations import quaternion_apply, quaternion_inverse, quaternion_multiply
@@ -206,15 +207,26 @@ def table_digest(
     height: float,
     rest: tuple[float, float, float, float],
 ) -> str:
-    """sha256 of everything a table depends on."""
-    digest = hashlib.sha256(FORMAT.encode())
+    """sha256 of everything a table depends on, with the numbers of the wrist controller and of the inverse kinematics."""
     robot = reach.robot
-    parts = (reach.settings, reach.base, reach.digest, grid, height, rest, sorted(robot.ignored_pairs))
-    digest.update(repr(parts).encode() + hand_digest(robot).encode() + robot.urdf.read_bytes())
-    digest.update(reach.start.numpy().tobytes())
-    for name in ("position", "quaternion", "approach", "pregrasp", "joints"):
-        digest.update(getattr(candidates, name).contiguous().cpu().numpy().tobytes())
-    return digest.hexdigest()
+    names = ("position", "quaternion", "approach", "pregrasp", "joints")
+    return digest_of(
+        {
+            "format": FORMAT,
+            "filter": reach.settings,
+            "kinematics": inverse_kinematics.NUMBERS,
+            "base": reach.base,
+            "object": reach.digest,
+            "grid": grid,
+            "height": height,
+            "rest": rest,
+            "ignored_pairs": sorted(robot.ignored_pairs),
+            "hand": hand_digest(robot),
+            "urdf": robot.urdf.read_bytes(),
+            "start": reach.start,
+            "candidates": {name: getattr(candidates, name).cpu() for name in names},
+        }
+    )
 
 
 def poses(

@@ -17,20 +17,28 @@ from dora.affordance.inverse_kinematics import LIMIT_MARGIN, pose_error
 from dora.robot import SerialChain
 from dora.robot.rotations import matrix_from_quaternion
 
-PERIOD = 0.05
-"""Control period [s]."""
-WRIST_SPEED = 0.6
-"""Fastest translation of the wrist [m/s]."""
-WRIST_SPIN = 2.0
-"""Fastest rotation of the wrist [rad/s]."""
-DESCENT = 0.0075
-"""Shortening of the standoff per control step [m]."""
-ARRIVED = (0.02, 0.15)
-"""Error at the standoff that begins the descent [m], [rad]."""
-SETTLED = (0.004, 0.04)
-"""Error that counts as having reached the candidate [m], [rad]; half of what lets the tasks' hand close."""
-MAX_STEPS = 90
-"""Control steps after which a motion has failed."""
+
+@dataclass(frozen=True)
+class Controller:
+    """Numbers of the wrist controller and of the reference that commands it, as far as a motion depends on them.
+
+    Attributes:
+        period: of the control [s].
+        speed: fastest translation of the wrist [m/s].
+        spin: fastest rotation of the wrist [rad/s].
+        descent: speed at which the standoff shrinks [m/s].
+        arrived: error at the standoff that begins the descent [m], [rad].
+        settled: error that counts as having reached the candidate [m], [rad]; half of what lets the tasks' hand close.
+        patience: control steps after which a motion has failed.
+    """
+
+    period: float = 0.05
+    speed: float = 0.6
+    spin: float = 2.0
+    descent: float = 0.15
+    arrived: tuple[float, float] = (0.02, 0.15)
+    settled: tuple[float, float] = (0.004, 0.04)
+    patience: int = 90
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +65,7 @@ def roll_out(
     quaternion: Float[Tensor, "n 4"],
     approach: Float[Tensor, "n 3"],
     standoff: float,
+    controller: Controller,
 ) -> Motions:
     """Motions from one posture to many wrist poses.
 
@@ -67,23 +76,25 @@ def roll_out(
         quaternion: of the wrist at the candidate, wxyz.
         approach: unit direction of the last part of the motion.
         standoff: length of that part [m].
+        controller: numbers of the controller.
     """
+    c = controller
     n, lower, upper = len(position), chain.lower + LIMIT_MARGIN, chain.upper - LIMIT_MARGIN
     rotation = matrix_from_quaternion(quaternion)
     left = torch.arange(n)
     q = start.expand(n, -1)
     back, descending = torch.full((n,), standoff), torch.zeros(n, dtype=torch.bool)
-    arrival, finish = torch.full((2, n), MAX_STEPS)
+    arrival, finish = torch.full((2, n), c.patience)
     history = [q.clone()]
-    for step in range(MAX_STEPS):
+    for step in range(c.patience):
         frames = chain.forward(q)
         error = pose_error(frames, position - approach * back[:, None], rotation)
         shift, turn = error[:, :3], error[:, 3:]
         away, angle = shift.norm(dim=-1), turn.norm(dim=-1)
-        begins = ~descending & (away < ARRIVED[0]) & (angle < ARRIVED[1])
+        begins = ~descending & (away < c.arrived[0]) & (angle < c.arrived[1])
         arrival[left[begins]] = step
         descending = descending | begins
-        done = descending & (back <= 0) & (away < SETTLED[0]) & (angle < SETTLED[1])
+        done = descending & (back <= 0) & (away < c.settled[0]) & (angle < c.settled[1])
         if done.any():
             finish[left[done]] = step
             keep = ~done
@@ -96,12 +107,12 @@ def roll_out(
                 break
             frames = type(frames)(*(x[keep] for x in frames))
         limited = [
-            v / (length / (speed * PERIOD)).clamp_min(1.0)[:, None]
-            for v, length, speed in ((shift, away, WRIST_SPEED), (turn, angle, WRIST_SPIN))
+            v / (length / (speed * c.period)).clamp_min(1.0)[:, None]
+            for v, length, speed in ((shift, away, c.speed), (turn, angle, c.spin))
         ]
-        q = q + chain.damped_step(q, torch.cat(limited, -1), duration=PERIOD, frames=frames)
+        q = q + chain.damped_step(q, torch.cat(limited, -1), duration=c.period, frames=frames)
         q = torch.clamp(q, lower, upper)
-        back = torch.where(descending, (back - DESCENT).clamp_min(0.0), back)
+        back = torch.where(descending, (back - c.descent * c.period).clamp_min(0.0), back)
         history.append(history[-1].index_copy(0, left, q))
     last = len(history) - 1
-    return Motions(torch.stack(history, 1), arrival.clamp_max(last), finish.clamp_max(last), finish < MAX_STEPS)
+    return Motions(torch.stack(history, 1), arrival.clamp_max(last), finish.clamp_max(last), finish < c.patience)

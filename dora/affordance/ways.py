@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dora.affordance.inverse_kinematics import InverseKinematics, Solutions
 from dora.affordance.planning import PlanSettings
-from dora.affordance.servo import roll_out
+from dora.affordance.servo import Controller, roll_out
 
 REASONS = (
     "ok",
@@ -45,6 +45,7 @@ class ReachSettings:
         seeds: starts of the inverse kinematics per candidate.
         stride: control steps between two postures that are checked with motion "servo".
         plan: effort of the planner.
+        controller: numbers of the wrist controller that motion "servo" rolls out.
     """
 
     motion: Literal["servo", "plan", "none"] = "servo"
@@ -58,6 +59,7 @@ class ReachSettings:
     seeds: int = 8
     stride: int = 3
     plan: PlanSettings = field(default_factory=PlanSettings)
+    controller: Controller = field(default_factory=Controller)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +108,8 @@ def _count(settings: ReachSettings) -> int:
 
 def _servo(kinematics: InverseKinematics, goals: Goals, start: Tensor, settings: ReachSettings) -> Ways:
     """Ways of the wrist controller; where it fails, the reason is out of reach if there is no solution at all."""
-    m = roll_out(kinematics.chain, start, goals.position, goals.quaternion, goals.approach, settings.standoff)
+    path = goals.position, goals.quaternion, goals.approach, settings.standoff
+    m = roll_out(kinematics.chain, start, *path, settings.controller)
     failure = torch.where(m.reached, OK, NO_MOTION)
     lost = (~m.reached).nonzero()[:, 0]
     solved = kinematics.solve(goals.position[lost], goals.quaternion[lost], settings.seeds).solved[:, 0]
