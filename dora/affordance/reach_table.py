@@ -207,7 +207,7 @@ def table_digest(
     height: float,
     rest: tuple[float, float, float, float],
 ) -> str:
-    """sha256 of everything a table depends on, with the numbers of the wrist controller and of the inverse kinematics."""
+    """sha256 of everything a table depends on, numbers of the controller and the inverse kinematics included."""
     robot = reach.robot
     names = ("position", "quaternion", "approach", "pregrasp", "joints")
     return digest_of(
