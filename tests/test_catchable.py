@@ -7,8 +7,8 @@ import torch
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.protocol import flexion
 from dora.affordance.shipped import load_candidates
+from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.robot import load_robot
-from dora.robot.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.tasks.catchable import REACH, TURN, with_waiting_hand, within_reach
 from dora.tasks.proving import usable_in_task
 

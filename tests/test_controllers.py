@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import dora.tasks as tasks
-from dora.robot.rotations import quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
+from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
 from dora.sim.controllers import LIMIT_MARGIN
 from dora.tasks.base import DoraEnv
 from dora.tasks.correction import wrist_step

@@ -19,8 +19,8 @@ from dora.affordance.energies import (
 )
 from dora.affordance.hand import HandModel
 from dora.affordance.signed_distance import SignedDistanceField
+from dora.geometry.rotations import matrix_from_rotation_vector
 from dora.robot import load_robot
-from dora.robot.rotations import matrix_from_rotation_vector
 
 COUNT, CONTACTS = 24, 8
 STEP = 1e-6

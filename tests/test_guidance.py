@@ -9,7 +9,7 @@ from invented import invented
 import dora.tasks as tasks
 from dora.affordance.candidates import GraspCandidates
 from dora.errors import InputError
-from dora.robot.rotations import quaternion_from_rotation_vector
+from dora.geometry.rotations import quaternion_from_rotation_vector
 from dora.tasks.choice import Choice
 from dora.tasks.correction import SMOOTHING, Bounds, Correction, Target
 from dora.tasks.disturbances import SENSOR_DRAWS, Disturbances, uniform

@@ -11,7 +11,12 @@ from mani_skill.utils.structs import Pose
 from torch import Tensor
 
 import dora.tasks as tasks
-from dora.robot.rotations import quaternion_apply, quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
+from dora.geometry.rotations import (
+    quaternion_apply,
+    quaternion_from_rotation_vector,
+    quaternion_multiply,
+    rotation_angle,
+)
 from dora.sim.substeps import watch_physics
 from dora.tasks import hammer
 from dora.tasks.catching import ALIGN, PHASES, CatchReference

@@ -7,8 +7,8 @@ import torch
 
 from dora.affordance.hand import PALM, HandModel
 from dora.affordance.hand_shapes import Capsule, capsules_of, farthest_points
+from dora.geometry.rotations import matrix_from_rotation_vector
 from dora.robot import RobotDescription, Shape, load_robot
-from dora.robot.rotations import matrix_from_rotation_vector
 
 POSITION_TOLERANCE = 1e-5
 """Largest accepted difference of two libraries' frames (m, and unitless for rotation entries)."""

@@ -13,8 +13,8 @@ from dora.affordance.objects import load_object
 from dora.affordance.protocol import STANDARD, Protocol, pregrasp, squeeze
 from dora.affordance.shipped import load_candidates
 from dora.affordance.signed_distance import SignedDistanceField
+from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import load_robot
-from dora.robot.rotations import matrix_from_quaternion
 
 ROBOT, CUBE = load_robot("diana7_hit"), load_object("cube")
 HELD = 0.02

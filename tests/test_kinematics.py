@@ -15,8 +15,8 @@ import sapien
 import torch
 
 from dora.errors import InputError
+from dora.geometry import rotations as rot
 from dora.robot import RobotDescription, SerialChain, load_robot
-from dora.robot import rotations as rot
 
 CONFIGURATIONS = 24
 POSITION_TOLERANCE = 1e-5

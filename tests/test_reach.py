@@ -18,14 +18,14 @@ from dora.affordance.reach import Reach
 from dora.affordance.reach_table import Grid, ReachTable, table_digest
 from dora.affordance.ways import HAND_OBJECT, HAND_TABLE, NO_MOTION, OK, OUT_OF_REACH, REASONS, ReachSettings
 from dora.errors import InputError
-from dora.robot import SerialChain, load_robot
-from dora.robot.rotations import (
+from dora.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_apply,
     quaternion_from_matrix,
     quaternion_multiply,
     rotation_vector_from_matrix,
 )
+from dora.robot import SerialChain, load_robot
 from dora.sim import controllers
 from dora.tasks import guidance
 from dora.tasks.building import BuiltEnv

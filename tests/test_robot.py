@@ -18,10 +18,10 @@ import trimesh
 import yaml
 
 from dora.errors import InputError
+from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import Coupling, RobotDescription, Shape, available_robots, load_robot
 from dora.robot.build import build_urdf, write_urdf
 from dora.robot.description import clique_cover
-from dora.robot.rotations import matrix_from_quaternion
 from dora.robot.shapes import merge_capsules
 from dora.robot.visuals import build_meshes
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dora.robot import rotations as rot
+from dora.geometry import rotations as rot
 
 EXACT = 1e-9
 """Largest accepted difference in double precision (rad or unitless)."""

@@ -30,8 +30,8 @@ from dora.affordance.rasteriser import Camera, seen
 from dora.affordance.shipped import shipped_path
 from dora.affordance.viewing import CONTACTS, VALID, Filter, GraspPage, Surface, describe
 from dora.errors import InputError
+from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import load_robot
-from dora.robot.rotations import matrix_from_quaternion
 
 COUNT = 12
 SMALL = 160

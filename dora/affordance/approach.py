@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.reach import Reach
-from dora.robot.rotations import quaternion_apply, quaternion_inverse
+from dora.geometry.rotations import quaternion_apply, quaternion_inverse
 
 
 def free_approaches(candidates: GraspCandidates, reach: Reach) -> tuple[GraspCandidates, Bool[Tensor, " c"]]:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dora.affordance.hand import HandModel
 from dora.affordance.signed_distance import CHANNELS, SignedDistanceField
-from dora.robot.rotations import matrix_from_quaternion
+from dora.geometry.rotations import matrix_from_quaternion
 
 TOUCH = 5e-3
 """Distance (m) between hand and surface below which they are in contact."""

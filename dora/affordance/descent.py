@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.affordance.energies import RAMPED, Evaluation, GraspEnergy
-from dora.robot.rotations import matrix_from_rotation_vector
+from dora.geometry.rotations import matrix_from_rotation_vector
 
 MEAN_DECAY, SQUARE_DECAY = 0.9, 0.98
 """Adam's decay rates."""

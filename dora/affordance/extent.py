@@ -14,9 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.affordance.collision import hand_links
+from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import RobotDescription, SerialChain, Shape
 from dora.robot.kinematics import Frames
-from dora.robot.rotations import matrix_from_quaternion
 
 RIM_POINTS = 16
 """Points on each rim of a cylinder."""

@@ -15,8 +15,8 @@ from torch import Tensor
 from trimesh.visual import ColorVisuals
 
 from dora.affordance.solids import shape_mesh
+from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import RobotDescription, SerialChain
-from dora.robot.rotations import matrix_from_quaternion
 
 GAMMA = 2.2
 """Exponent between the linear colours of a glTF material and what a screen shows."""

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 import trimesh
 
+from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import Shape
-from dora.robot.rotations import matrix_from_quaternion
 
 SAGITTA = 6e-4
 """Deepest groove (m) between neighbouring spheres on a capsule's axis."""

@@ -21,9 +21,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dora.errors import InputError
+from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import RobotDescription, SerialChain
 from dora.robot.kinematics import DAMPING, Frames
-from dora.robot.rotations import matrix_from_quaternion
 
 POSITION_TOLERANCE = 2e-4
 """Largest error of a solution's wrist position [m]."""

@@ -24,8 +24,8 @@ from dora.affordance.search import Search, Settings
 from dora.affordance.structure import AffordanceObject
 from dora.affordance.voting import NO_CONTACT, vote
 from dora.errors import InputError
+from dora.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from dora.robot import RobotDescription
-from dora.robot.rotations import matrix_from_quaternion, quaternion_from_matrix
 
 __all__ = ["Settings", "optimise"]
 

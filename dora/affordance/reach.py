@@ -34,14 +34,14 @@ from dora.affordance.ways import (
     attempts,
 )
 from dora.errors import InputError
-from dora.robot import RobotDescription, Shape
-from dora.robot.rotations import (
+from dora.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_apply,
     quaternion_from_matrix,
     quaternion_inverse,
     quaternion_multiply,
 )
+from dora.robot import RobotDescription, Shape
 
 CLOSINGS = (0.0, 0.5, 1.0)
 """Shares of the way from the opened hand to contact at which the hand's height over the table is taken."""

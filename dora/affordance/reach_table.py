@@ -24,7 +24,7 @@ from dora.affordance.ways import OK
 from dora.digests import digest_of
 from dora.errors import InputError
 from dora.files import read_tensors, write_tensors
-from dora.robot.rotations import quaternion_apply, quaternion_inverse, quaternion_multiply
+from dora.geometry.rotations import quaternion_apply, quaternion_inverse, quaternion_multiply
 
 FORMAT = "dora-reach 1"
 """Format and version of a stored table; the version changes with the filter's meaning."""

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dora.affordance.inverse_kinematics import LIMIT_MARGIN, pose_error
+from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import SerialChain
-from dora.robot.rotations import matrix_from_quaternion
 
 
 @dataclass(frozen=True)

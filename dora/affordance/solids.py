@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from dora.robot.rotations import quaternion_from_matrix
+from dora.geometry.rotations import quaternion_from_matrix
 from dora.robot.shapes import Shape
 
 AROUND = 24

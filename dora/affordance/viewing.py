@@ -20,8 +20,8 @@ from dora.affordance.palette import PALETTE, colours
 from dora.affordance.pictures import PARTS
 from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
+from dora.geometry.rotations import quaternion_from_matrix
 from dora.robot import RobotDescription
-from dora.robot.rotations import quaternion_from_matrix
 
 MOST_HANDS = 16
 """Hands that a page can show at once."""

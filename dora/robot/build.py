@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from dora.errors import InputError
-from dora.robot.rotations import rpy_from_z_axis
+from dora.geometry.rotations import rpy_from_z_axis
 
 Row = Mapping[str, Any]
 INERTIA_NAMES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")

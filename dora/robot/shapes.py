@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from dora.robot.rotations import quaternion_apply
+from dora.geometry.rotations import quaternion_apply
 
 MERGE_TOLERANCE = 1e-6
 """Largest difference (m) between a cylinder's end and a sphere that makes them one capsule."""

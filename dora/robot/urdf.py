@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from dora.errors import InputError
-from dora.robot.rotations import matrix_from_quaternion, quaternion_from_rpy, quaternion_multiply
+from dora.geometry.rotations import matrix_from_quaternion, quaternion_from_rpy, quaternion_multiply
 from dora.robot.shapes import Shape, merge_capsules
 
 MOVING = ("revolute", "prismatic", "continuous")

@@ -14,9 +14,9 @@ from mani_skill.agents.controllers.base_controller import BaseController, Contro
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController, PDJointPosControllerConfig
 from torch import Tensor
 
+from dora.geometry.rotations import quaternion_from_matrix
 from dora.robot.description import RobotDescription
 from dora.robot.kinematics import Frames, SerialChain
-from dora.robot.rotations import quaternion_from_matrix
 
 WRIST_SPEED = 0.6
 """Linear wrist speed of a full action along one axis [m/s], unless a task sets its own."""

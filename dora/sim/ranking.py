@@ -19,13 +19,13 @@ from dora.affordance.candidates import GraspCandidates
 from dora.affordance.protocol import STANDARD
 from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
-from dora.robot import RobotDescription
-from dora.robot.rotations import (
+from dora.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_apply,
     quaternion_from_rotation_vector,
     quaternion_multiply,
 )
+from dora.robot import RobotDescription
 from dora.sim.rig import Physics, Rig
 from dora.sim.validation import check_object
 from dora.sim.workers import Progress, run_cases

@@ -14,9 +14,9 @@ from sapien.physx import PhysxMaterial
 from torch import Tensor
 
 from dora.errors import InputError
+from dora.geometry.rotations import quaternion_apply, quaternion_from_matrix, quaternion_multiply
 from dora.robot import RobotDescription, available_robots, load_robot
 from dora.robot.kinematics import SerialChain
-from dora.robot.rotations import quaternion_apply, quaternion_from_matrix, quaternion_multiply
 from dora.sim.controllers import CoupledJointPosConfig, WristHandConfig, WristHandController
 
 CONTROL_MODES = ("wrist_delta_hand_pos", "pd_joint_pos", "pd_joint_delta_pos")

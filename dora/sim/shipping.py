@@ -21,9 +21,9 @@ from dora.affordance.reach_table import Grid, poses
 from dora.affordance.shipped import ROBOT, shipped_path
 from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
+from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.progress import PhaseProgress
 from dora.robot import RobotDescription, load_robot
-from dora.robot.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.sim.ranking import Execution, rank
 from dora.sim.validation import validate
 

@@ -18,8 +18,8 @@ from dora.affordance.prepared import map_of
 from dora.affordance.protocol import DIRECTIONS, STANDARD, Protocol
 from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
+from dora.geometry.rotations import matrix_from_quaternion, quaternion_apply, quaternion_inverse
 from dora.robot import RobotDescription
-from dora.robot.rotations import matrix_from_quaternion, quaternion_apply, quaternion_inverse
 from dora.sim.grip import Grip
 from dora.sim.rig import Physics, Rig
 from dora.sim.workers import Progress, run_cases

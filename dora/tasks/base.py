@@ -13,7 +13,7 @@ from mani_skill.utils.structs import Pose
 from torch import Tensor
 
 from dora.errors import InputError
-from dora.robot.rotations import quaternion_from_rotation_vector
+from dora.geometry.rotations import quaternion_from_rotation_vector
 from dora.sim.batch.actions import check_action
 from dora.tasks.building import SCALE_DRAW, BuiltEnv
 from dora.tasks.choice import ERROR_DRAWS

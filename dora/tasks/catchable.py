@@ -8,8 +8,8 @@ from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.protocol import flexion
+from dora.geometry.rotations import quaternion_apply, rotation_angle
 from dora.robot import RobotDescription
-from dora.robot.rotations import quaternion_apply, rotation_angle
 from dora.tasks.choice import in_world
 from dora.tasks.hammering import slid
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dora.robot.rotations import (
+from dora.geometry.rotations import (
     quaternion_apply,
     quaternion_from_rotation_vector,
     quaternion_inverse,

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.robot.rotations import (
+from dora.geometry.rotations import (
     quaternion_apply,
     quaternion_from_rotation_vector,
     quaternion_multiply,

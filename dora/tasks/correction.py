@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dora.errors import InputError
-from dora.robot.rotations import (
+from dora.geometry.rotations import (
     quaternion_apply,
     quaternion_from_rotation_vector,
     quaternion_inverse,

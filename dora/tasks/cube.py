@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.reach_table import Grid
-from dora.robot.rotations import quaternion_apply, quaternion_multiply
+from dora.geometry.rotations import quaternion_apply, quaternion_multiply
 from dora.tasks.base import STANDING_DRAWS, DoraEnv
 from dora.tasks.observations import Entry
 from dora.tasks.rewards import Term, Terms, closeness

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dora.robot.rotations import quaternion_from_rotation_vector, quaternion_multiply
+from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.tasks.choice import Choice
 from dora.tasks.presets import Preset
 from dora.tasks.snapshot import S, observed

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dora.errors import InputError
-from dora.robot.rotations import rotation_angle
+from dora.geometry.rotations import rotation_angle
 from dora.tasks.choice import Choice
 from dora.tasks.correction import Correction, Target
 from dora.tasks.reference import Reference

@@ -16,7 +16,7 @@ from torch import Tensor
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.objects import load_object
 from dora.affordance.shipped import best_candidates
-from dora.robot.rotations import (
+from dora.geometry.rotations import (
     quaternion_from_rotation_vector,
     quaternion_multiply,
     rotation_angle,

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dora.robot.rotations import quaternion_apply, quaternion_inverse
+from dora.geometry.rotations import quaternion_apply, quaternion_inverse
 from dora.tasks.snapshot import TIP_RADIUS, Snapshot, derived, in_wrist
 
 GRIP = (0.045, 0.0, 0.150)

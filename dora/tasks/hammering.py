@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dora.robot.rotations import (
+from dora.geometry.rotations import (
     quaternion_apply,
     quaternion_from_matrix,
     quaternion_from_rotation_vector,

@@ -18,7 +18,7 @@ from dora.affordance.reach_table import Grid
 from dora.affordance.shipped import best_candidates
 from dora.affordance.structure import AffordanceObject
 from dora.affordance.voting import vote
-from dora.robot.rotations import quaternion_apply
+from dora.geometry.rotations import quaternion_apply
 from dora.sim.objects import build_object
 from dora.tasks.base import STANDING_DRAWS, DoraEnv
 from dora.tasks.guidance import GraspReference

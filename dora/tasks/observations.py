@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dora.robot.rotations import (
+from dora.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_apply,
     quaternion_inverse,

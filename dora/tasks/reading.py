@@ -8,7 +8,7 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Link
 from torch import Tensor
 
-from dora.robot.rotations import quaternion_apply, quaternion_inverse
+from dora.geometry.rotations import quaternion_apply, quaternion_inverse
 from dora.sim.bodies import BodyReader
 from dora.sim.contacts import ContactMonitor, Contacts
 from dora.sim.robot import DescribedRobot

@@ -1,0 +1,1 @@
+"""Rotations and rigid poses as batched tensors; no robot, no simulator."""
