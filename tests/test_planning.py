@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from dora.affordance import collision
-from dora.affordance.collision import KINDS, CollisionModel
-from dora.affordance.planning import EDGE_LIMIT, PlanSettings, densified, plan, timed
 from dora.errors import InputError
 from dora.robot import Shape, load_robot
+from dora.robot.motion import collision
+from dora.robot.motion.collision import KINDS, CollisionModel
+from dora.robot.motion.planning import EDGE_LIMIT, PlanSettings, densified, plan, timed
 
 WALL = Shape("box", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.02, 0.25, 0.3))
 WALL_PLACE = np.array([0.55, 0.25, 0.3]), np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])

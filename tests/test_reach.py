@@ -7,13 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from dora.affordance import inverse_kinematics, servo
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.collision import CollisionModel
-from dora.affordance.extent import ArmExtent, HandExtent
-from dora.affordance.inverse_kinematics import ANGLE_TOLERANCE, POSITION_TOLERANCE, InverseKinematics
 from dora.affordance.objects import load_object
-from dora.affordance.planning import densified
 from dora.affordance.reach import Reach
 from dora.affordance.reach_table import Grid, ReachTable, table_digest
 from dora.affordance.ways import HAND_OBJECT, HAND_TABLE, NO_MOTION, OK, OUT_OF_REACH, REASONS, ReachSettings
@@ -26,6 +21,12 @@ from dora.geometry.rotations import (
     rotation_vector_from_matrix,
 )
 from dora.robot import SerialChain, load_robot
+from dora.robot.motion import controller_rollout as servo
+from dora.robot.motion import inverse_kinematics
+from dora.robot.motion.collision import CollisionModel
+from dora.robot.motion.height_bounds import ArmExtent, HandExtent
+from dora.robot.motion.inverse_kinematics import ANGLE_TOLERANCE, POSITION_TOLERANCE, InverseKinematics
+from dora.robot.motion.planning import densified
 from dora.sim import controllers
 from dora.tasks import guidance
 from dora.tasks.building import BuiltEnv

@@ -15,13 +15,13 @@ from dora.affordance.candidates import GraspCandidates
 from dora.affordance.objects import load_object
 from dora.affordance.protocol import STANDARD, Protocol, flexion, pregrasp, squeeze
 from dora.errors import InputError
+from dora.parallel import run_cases
 from dora.robot import load_robot
 from dora.sim import BACKEND
 from dora.sim.batch.scene import BatchScene
 from dora.sim.objects import build_object, object_entity
 from dora.sim.rig import Physics, Rig
 from dora.sim.validation import Reason, validate
-from dora.sim.workers import run_cases
 
 ROBOT = load_robot("diana7_hit")
 CUBE = load_object("cube")

@@ -16,10 +16,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.collision import CollisionModel
-from dora.affordance.extent import ArmExtent, HandExtent
-from dora.affordance.inverse_kinematics import InverseKinematics
-from dora.affordance.planning import plan
 from dora.affordance.structure import AffordanceObject
 from dora.affordance.ways import (
     ARM_COLLISION,
@@ -42,6 +38,10 @@ from dora.geometry.rotations import (
     quaternion_multiply,
 )
 from dora.robot import RobotDescription, Shape
+from dora.robot.motion.collision import CollisionModel
+from dora.robot.motion.height_bounds import ArmExtent, HandExtent
+from dora.robot.motion.inverse_kinematics import InverseKinematics
+from dora.robot.motion.planning import plan
 
 CLOSINGS = (0.0, 0.5, 1.0)
 """Shares of the way from the opened hand to contact at which the hand's height over the table is taken."""
@@ -169,7 +169,7 @@ class Reach:
         object_q: Float[Tensor, " 4"],
         seed: int = 0,
     ) -> Float[np.ndarray, "k dof"] | None:
-        """Collision-free way points [rad] between two arm postures, see `dora.affordance.planning.plan`."""
+        """Collision-free way points [rad] between two arm postures, see `dora.robot.motion.planning.plan`."""
         position, quaternion = self._in_base(object_p[None], object_q[None])
         model = self._model("transit")
         model.place_object(position[0].double().numpy(), quaternion[0].double().numpy())

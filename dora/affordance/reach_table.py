@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from dora.affordance import inverse_kinematics
 from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.decomposition import cache_folder
 from dora.affordance.reach import Reach
@@ -25,6 +24,7 @@ from dora.digests import digest_of
 from dora.errors import InputError
 from dora.files import read_tensors, write_tensors
 from dora.geometry.rotations import quaternion_apply, quaternion_inverse, quaternion_multiply
+from dora.robot.motion import inverse_kinematics
 
 FORMAT = "dora-reach 1"
 """Format and version of a stored table; the version changes with the filter's meaning."""

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dora.affordance.inverse_kinematics import InverseKinematics, Solutions
-from dora.affordance.planning import PlanSettings
-from dora.affordance.servo import Controller, roll_out
+from dora.robot.motion.controller_rollout import Controller, roll_out
+from dora.robot.motion.inverse_kinematics import InverseKinematics, Solutions
+from dora.robot.motion.planning import PlanSettings
 
 REASONS = (
     "ok",

@@ -21,10 +21,10 @@ from dora.affordance.prepared import map_of
 from dora.affordance.protocol import STANDARD, Protocol
 from dora.affordance.structure import AffordanceObject
 from dora.affordance.voting import vote
+from dora.parallel import warm_up
 from dora.progress import PhaseProgress
 from dora.robot import RobotDescription
 from dora.sim.validation import Validation, validate
-from dora.sim.workers import warm_up
 
 MILLIMETRES = 1000.0
 """Per metre."""

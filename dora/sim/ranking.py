@@ -25,10 +25,10 @@ from dora.geometry.rotations import (
     quaternion_from_rotation_vector,
     quaternion_multiply,
 )
+from dora.parallel import Progress, run_cases
 from dora.robot import RobotDescription
 from dora.sim.rig import Physics, Rig
 from dora.sim.validation import check_object
-from dora.sim.workers import Progress, run_cases
 
 Purpose = Literal["ranking", "reporting"]
 _STREAM: dict[Purpose, int] = {"ranking": 0, "reporting": 1}

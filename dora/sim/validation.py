@@ -19,10 +19,10 @@ from dora.affordance.protocol import DIRECTIONS, STANDARD, Protocol
 from dora.affordance.structure import AffordanceObject
 from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion, quaternion_apply, quaternion_inverse
+from dora.parallel import Progress, run_cases
 from dora.robot import RobotDescription
 from dora.sim.grip import Grip
 from dora.sim.rig import Physics, Rig
-from dora.sim.workers import Progress, run_cases
 
 LOOK = 0.05
 """Time between measurements of the displacement [s]."""

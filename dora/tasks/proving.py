@@ -17,7 +17,7 @@ from dora.affordance.candidates import GraspCandidates, concatenate
 from dora.affordance.objects import load_object
 from dora.affordance.optimise import OFF_TABLE
 from dora.affordance.shipped import data_folder, load_candidates, shipped_path
-from dora.sim.workers import run_cases
+from dora.parallel import run_cases
 from dora.tasks import make_task
 from dora.tasks.base import DoraEnv
 

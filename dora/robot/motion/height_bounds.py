@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dora.affordance.collision import hand_links
 from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import RobotDescription, SerialChain, Shape
 from dora.robot.kinematics import Frames
+from dora.robot.motion.collision import hand_links
 
 RIM_POINTS = 16
 """Points on each rim of a cylinder."""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from dora.affordance.collision import CollisionModel, need
 from dora.errors import InputError
+from dora.robot.motion.collision import CollisionModel, need
 
 RESOLUTION = 0.02
 """Distance in joint space between two postures that are checked while planning [rad]."""

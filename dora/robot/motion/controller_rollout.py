@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dora.affordance.inverse_kinematics import LIMIT_MARGIN, pose_error
 from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import SerialChain
+from dora.robot.motion.inverse_kinematics import LIMIT_MARGIN, pose_error
 
 
 @dataclass(frozen=True)
