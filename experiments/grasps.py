@@ -14,9 +14,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from dora.affordance.importing import import_object
-from dora.affordance.objects import load_object
-from dora.affordance.structure import AffordanceObject
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.objects.importing import import_object
 from dora.errors import InputError
 from dora.progress import PhaseProgress
 from dora.robot import load_robot

@@ -18,13 +18,13 @@ from typing import Annotated, Literal
 
 import tyro
 
-from dora.affordance.album import write_album, write_objects
+from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.importing import import_object
-from dora.affordance.objects import available_objects, load_object
-from dora.affordance.shipped import load_candidates
-from dora.affordance.structure import AffordanceObject
-from dora.affordance.viewing import GraspPage
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.objects.catalogue import available_objects, load_object
+from dora.affordance.objects.importing import import_object
+from dora.affordance.views.album import write_album, write_objects
+from dora.affordance.views.page import GraspPage
 from dora.errors import InputError
 from dora.robot import load_robot
 

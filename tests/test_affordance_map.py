@@ -11,11 +11,11 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dora.affordance.lookup import NearestTable, nearest_by_comparison
-from dora.affordance.map import COUNT, AffordanceMap
-from dora.affordance.objects import load_object
-from dora.affordance.palette import PALETTE
-from dora.affordance.sampling import sample_evenly
+from dora.affordance.maps.affordance_map import COUNT, AffordanceMap
+from dora.affordance.maps.nearest_points import NearestTable, nearest_by_comparison
+from dora.affordance.maps.poisson_disk import sample_evenly
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.views.palette import PALETTE
 from dora.errors import InputError
 
 NAMES = ("cube", "jug", "hammer", "microwave")

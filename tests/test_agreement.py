@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dora.affordance.agreement import CLEAR, FEWEST, Agreement, clearly_held
+from dora.affordance.maps.confusion import CLEAR, FEWEST, Agreement, clearly_held
 
 NAMES = ("handle", "head", "face")
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dora.affordance.candidates import GraspCandidates, concatenate, hand_digest
-from dora.affordance.objects import AffordanceObject, load_object
+from dora.affordance.objects.catalogue import AffordanceObject, load_object
 from dora.errors import InputError
 from dora.robot import RobotDescription, load_robot
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import torch
 
+from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.protocol import flexion
-from dora.affordance.shipped import load_candidates
+from dora.affordance.hand.protocol import flexion
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.robot import load_robot
 from dora.tasks.catchable import REACH, TURN, with_waiting_hand, within_reach

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from dora.affordance.bundled_sets import data_folder, load_candidates
 from dora.affordance.candidates import hand_digest
-from dora.affordance.objects import available_objects
-from dora.affordance.shipped import data_folder, load_candidates
+from dora.affordance.objects.catalogue import available_objects
 from dora.agents.checkpoint import read_checkpoint
 from dora.digests import KEY, digest_of
 from dora.robot import load_robot

@@ -7,8 +7,10 @@ import pytest
 import torch
 import trimesh
 
-from dora.affordance.compiled import CompiledEnergy
-from dora.affordance.energies import (
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.objects.signed_distance import SignedDistanceField
+from dora.affordance.search.compiled import CompiledEnergy
+from dora.affordance.search.energies import (
     LENGTH,
     TERMS,
     GraspEnergy,
@@ -17,8 +19,6 @@ from dora.affordance.energies import (
     net_wrench,
     segment_points,
 )
-from dora.affordance.hand import HandModel
-from dora.affordance.signed_distance import SignedDistanceField
 from dora.geometry.rotations import matrix_from_rotation_vector
 from dora.robot import load_robot
 

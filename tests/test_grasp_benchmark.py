@@ -9,16 +9,16 @@ from numpy.testing import assert_allclose
 
 from dora.affordance import benchmark
 from dora.affordance.benchmark import GraspBenchmark, measure
-from dora.affordance.compiled import CompiledDescent, CompiledEnergy
-from dora.affordance.descent import Rows
-from dora.affordance.energies import TERMS, Weights
-from dora.affordance.hand import HandModel
-from dora.affordance.initial import InitialPoses, Spread
-from dora.affordance.native.parts import PARTS, repeat
-from dora.affordance.objects import load_object
-from dora.affordance.optimise import table_of
-from dora.affordance.search import Search, Settings
-from dora.affordance.signed_distance import SignedDistanceField
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.objects.signed_distance import SignedDistanceField
+from dora.affordance.search.compiled import CompiledDescent, CompiledEnergy
+from dora.affordance.search.descent import Rows
+from dora.affordance.search.energies import TERMS, Weights
+from dora.affordance.search.initial_poses import InitialPoses, Spread
+from dora.affordance.search.native.parts import PARTS, repeat
+from dora.affordance.search.optimise import table_of
+from dora.affordance.search.search import Search, Settings
 from dora.errors import InputError
 from dora.robot import load_robot
 

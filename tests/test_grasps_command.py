@@ -11,11 +11,11 @@ import pytest
 import torch
 from commands import call, load_command
 
+from dora.affordance.bundled_sets import shipped_path
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.objects import load_object
-from dora.affordance.optimise import Settings
-from dora.affordance.protocol import STANDARD
-from dora.affordance.shipped import shipped_path
+from dora.affordance.hand.protocol import STANDARD
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.search.optimise import Settings
 from dora.progress import PhaseProgress
 from dora.robot import load_robot
 from dora.sim import grasps

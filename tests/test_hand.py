@@ -5,8 +5,8 @@ import pytest
 import pytorch_kinematics
 import torch
 
-from dora.affordance.hand import PALM, HandModel
-from dora.affordance.hand_shapes import Capsule, capsules_of, farthest_points
+from dora.affordance.hand.capsules import Capsule, capsules_of, farthest_points
+from dora.affordance.hand.hand_model import PALM, HandModel
 from dora.geometry.rotations import matrix_from_rotation_vector
 from dora.robot import RobotDescription, Shape, load_robot
 

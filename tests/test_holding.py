@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dora.affordance.compiled import CompiledEnergy
-from dora.affordance.contact_map import wrist_matrix
-from dora.affordance.hand import HandModel
-from dora.affordance.holding import Holding, hold
-from dora.affordance.objects import load_object
-from dora.affordance.protocol import STANDARD, Protocol, pregrasp, squeeze
-from dora.affordance.shipped import load_candidates
-from dora.affordance.signed_distance import SignedDistanceField
+from dora.affordance.bundled_sets import load_candidates
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.hand.protocol import STANDARD, Protocol, pregrasp, squeeze
+from dora.affordance.maps.contact_semantic_map import wrist_matrix
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.objects.signed_distance import SignedDistanceField
+from dora.affordance.search.compiled import CompiledEnergy
+from dora.affordance.search.quasi_static_closing import Holding, hold
 from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import load_robot
 

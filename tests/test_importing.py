@@ -10,11 +10,11 @@ import pytest
 import torch
 import trimesh
 
-from dora.affordance.importing import import_object, read_mesh, resting_pose
-from dora.affordance.labels import grasp_class, read_labels
-from dora.affordance.map import AffordanceMap
-from dora.affordance.structure import moved
-from dora.affordance.surface_repair import repair
+from dora.affordance.maps.affordance_map import AffordanceMap
+from dora.affordance.objects.affordance_object import moved
+from dora.affordance.objects.importing import import_object, read_mesh, resting_pose
+from dora.affordance.objects.labels import grasp_class, read_labels
+from dora.affordance.objects.surface_repair import repair
 from dora.errors import InputError
 
 BODY, GRIP = (0.06, 0.06, 0.10), (0.05, 0.016, 0.016)
@@ -203,7 +203,7 @@ def test_refuses_files_without_a_surface(tmp_path: Path, monkeypatch: pytest.Mon
     for name in ("letter.stl", "thing.docx"):
         with pytest.raises(InputError, match=r"cannot be read|no triangles"):
             read_mesh(tmp_path / name)
-    monkeypatch.setattr("dora.affordance.importing.MOST_FACES", 10)
+    monkeypatch.setattr("dora.affordance.objects.importing.MOST_FACES", 10)
     with pytest.raises(InputError, match="has 12 faces; reduce it to at most 10"):
         read_mesh(written(tmp_path, block()))
 

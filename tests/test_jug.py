@@ -8,7 +8,7 @@ from invented import invented
 from torch import Tensor
 
 import dora.tasks as tasks
-from dora.affordance.objects import load_object
+from dora.affordance.objects.catalogue import load_object
 from dora.tasks import jug
 from dora.tasks.snapshot import CONTACT_CLASSES, Snapshot
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from dora.affordance import decomposition
-from dora.affordance.decomposition import decompose, deviation
-from dora.affordance.objects import AffordanceObject, available_objects, load_object
-from dora.affordance.solids import capsule_between, fitted, hull_of, lathe, loft, shape_mesh, simplified, unite
-from dora.affordance.structure import mass_properties, moved, surface_digest
+from dora.affordance.objects import decomposition
+from dora.affordance.objects.affordance_object import mass_properties, moved, surface_digest
+from dora.affordance.objects.catalogue import AffordanceObject, available_objects, load_object
+from dora.affordance.objects.decomposition import decompose, deviation
+from dora.affordance.objects.solids import capsule_between, fitted, hull_of, lathe, loft, shape_mesh, simplified, unite
 from dora.errors import InputError
 from dora.robot.shapes import Shape
 
@@ -187,7 +187,7 @@ def test_objects_are_found_by_name_and_built_once():
 
 
 def test_building_again_gives_the_same_object():
-    from dora.affordance.models import jug
+    from dora.affordance.objects.models import jug
 
     first, second = load_object("jug"), jug.build()
     assert first.digest == second.digest

@@ -7,20 +7,20 @@ import pytest
 import torch
 import trimesh
 
-from dora.affordance.compiled import CompiledDescent, CompiledEnergy
-from dora.affordance.contact_map import pressed_contacts, wrist_matrix
-from dora.affordance.descent import Descent, Schedule
-from dora.affordance.energies import GraspEnergy, Weights
-from dora.affordance.hand import HandModel
-from dora.affordance.holding import hold
-from dora.affordance.importing import import_object
-from dora.affordance.initial import InitialPoses, Spread
-from dora.affordance.objects import load_object
-from dora.affordance.optimise import opened, optimise, table_of
-from dora.affordance.prepared import field_of, forget, hand_of
-from dora.affordance.protocol import STANDARD, pregrasp, squeeze
-from dora.affordance.search import Search, Settings
-from dora.affordance.signed_distance import ExactDistance, SignedDistanceField
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.hand.protocol import STANDARD, pregrasp, squeeze
+from dora.affordance.maps.contact_semantic_map import pressed_contacts, wrist_matrix
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.objects.importing import import_object
+from dora.affordance.objects.signed_distance import ExactDistance, SignedDistanceField
+from dora.affordance.search.cache import field_of, forget, hand_of
+from dora.affordance.search.compiled import CompiledDescent, CompiledEnergy
+from dora.affordance.search.descent import Descent, Schedule
+from dora.affordance.search.energies import GraspEnergy, Weights
+from dora.affordance.search.initial_poses import InitialPoses, Spread
+from dora.affordance.search.optimise import opened, optimise, table_of
+from dora.affordance.search.quasi_static_closing import hold
+from dora.affordance.search.search import Search, Settings
 from dora.errors import InputError
 from dora.robot import load_robot
 

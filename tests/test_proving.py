@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dora.affordance.bundled_sets import data_folder, load_candidates
 from dora.affordance.candidates import concatenate
-from dora.affordance.shipped import data_folder, load_candidates
 from dora.tasks import make_task
 from dora.tasks.proving import TASKS, Proof, _Balanced, prove, ranked
 

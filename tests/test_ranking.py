@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from dora.affordance.objects import load_object
-from dora.affordance.shipped import load_candidates
+from dora.affordance.bundled_sets import load_candidates
+from dora.affordance.objects.catalogue import load_object
 from dora.errors import InputError
 from dora.robot import load_robot
 from dora.sim.ranking import Execution, Purpose, lifts_of, rank

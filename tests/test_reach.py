@@ -8,10 +8,18 @@ import pytest
 import torch
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.objects import load_object
-from dora.affordance.reach import Reach
-from dora.affordance.reach_table import Grid, ReachTable, table_digest
-from dora.affordance.ways import HAND_OBJECT, HAND_TABLE, NO_MOTION, OK, OUT_OF_REACH, REASONS, ReachSettings
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.reach.approach_paths import (
+    HAND_OBJECT,
+    HAND_TABLE,
+    NO_MOTION,
+    OK,
+    OUT_OF_REACH,
+    REASONS,
+    ReachSettings,
+)
+from dora.affordance.reach.feasibility import Reach
+from dora.affordance.reach.feasibility_table import Grid, ReachTable, table_digest
 from dora.errors import InputError
 from dora.geometry.rotations import (
     matrix_from_quaternion,

@@ -7,16 +7,16 @@ import torch
 import trimesh
 from torch import Tensor
 
-from dora.affordance.compiled import CompiledEnergy
-from dora.affordance.descent import Descent, Rows, Schedule
-from dora.affordance.energies import RAMPED, Evaluation, GraspEnergy
-from dora.affordance.hand import HandModel
-from dora.affordance.initial import InitialPoses, Spread
-from dora.affordance.measures import Penetration, self_penetration
-from dora.affordance.objects import load_object
-from dora.affordance.prepared import field_of, forget, hand_of, initial_of, map_of
-from dora.affordance.search import LAST_STEP, POLISH_STEP, Search, Settings, fading
-from dora.affordance.signed_distance import CHANNELS, SignedDistanceField
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.objects.signed_distance import CHANNELS, SignedDistanceField
+from dora.affordance.search.cache import field_of, forget, hand_of, initial_of, map_of
+from dora.affordance.search.compiled import CompiledEnergy
+from dora.affordance.search.descent import Descent, Rows, Schedule
+from dora.affordance.search.energies import RAMPED, Evaluation, GraspEnergy
+from dora.affordance.search.initial_poses import InitialPoses, Spread
+from dora.affordance.search.penetration import Penetration, self_penetration
+from dora.affordance.search.search import LAST_STEP, POLISH_STEP, Search, Settings, fading
 from dora.robot import load_robot
 
 ROBOT, CUBE, JUG = load_robot("diana7_hit"), load_object("cube"), load_object("jug")

@@ -7,8 +7,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dora.affordance.objects import load_object
-from dora.affordance.signed_distance import CHANNELS, ExactDistance, SignedDistanceField
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.objects.signed_distance import CHANNELS, ExactDistance, SignedDistanceField
 from dora.errors import InputError
 
 SIZES = st.floats(0.01, 0.08)

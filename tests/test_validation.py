@@ -12,8 +12,8 @@ from mani_skill.envs.utils.system.backend import BackendInfo
 from sapien import physx
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.objects import load_object
-from dora.affordance.protocol import STANDARD, Protocol, flexion, pregrasp, squeeze
+from dora.affordance.hand.protocol import STANDARD, Protocol, flexion, pregrasp, squeeze
+from dora.affordance.objects.catalogue import load_object
 from dora.errors import InputError
 from dora.parallel import run_cases
 from dora.robot import load_robot

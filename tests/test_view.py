@@ -18,17 +18,18 @@ from commands import call, load_command
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from dora.affordance import album, pictures, viewing
-from dora.affordance.album import chosen
+from dora.affordance.bundled_sets import shipped_path
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand import HandModel
-from dora.affordance.hand_mesh import HandMesh, joined
-from dora.affordance.objects import available_objects, load_object
-from dora.affordance.palette import PALETTE
-from dora.affordance.pictures import PARTS, TILE, best_view
-from dora.affordance.rasteriser import Camera, seen
-from dora.affordance.shipped import shipped_path
-from dora.affordance.viewing import CONTACTS, VALID, Filter, GraspPage, Surface, describe
+from dora.affordance.hand.hand_mesh import HandMesh, joined
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.objects.catalogue import available_objects, load_object
+from dora.affordance.views import album, pictures
+from dora.affordance.views import page as viewing
+from dora.affordance.views.album import chosen
+from dora.affordance.views.page import CONTACTS, VALID, Filter, GraspPage, Surface, describe
+from dora.affordance.views.palette import PALETTE
+from dora.affordance.views.pictures import PARTS, TILE, best_view
+from dora.affordance.views.rasteriser import Camera, seen
 from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import load_robot

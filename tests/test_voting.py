@@ -10,12 +10,17 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dora.affordance.contact_map import contact_semantic_map, hand_contacts, pressed_contacts, wrist_matrix
-from dora.affordance.hand import HandModel
-from dora.affordance.map import AffordanceMap
-from dora.affordance.objects import load_object
-from dora.affordance.signed_distance import SignedDistanceField
-from dora.affordance.voting import NO_CONTACT, VotingSettings, vote
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.maps.affordance_map import AffordanceMap
+from dora.affordance.maps.contact_semantic_map import (
+    contact_semantic_map,
+    hand_contacts,
+    pressed_contacts,
+    wrist_matrix,
+)
+from dora.affordance.maps.voting import NO_CONTACT, VotingSettings, vote
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.objects.signed_distance import SignedDistanceField
 from dora.errors import InputError
 from dora.robot import load_robot
 

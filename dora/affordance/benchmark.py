@@ -18,20 +18,20 @@ import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dora.affordance.compiled import CompiledDescent, CompiledEnergy
-from dora.affordance.descent import Rows, Schedule
-from dora.affordance.energies import GraspEnergy
-from dora.affordance.hand import HandModel
-from dora.affordance.holding import hold
-from dora.affordance.initial import InitialPoses
-from dora.affordance.native.parts import PARTS, repeat
-from dora.affordance.objects import load_object
-from dora.affordance.optimise import optimise, seated, table_of
-from dora.affordance.prepared import forget
-from dora.affordance.protocol import pregrasp, squeeze
-from dora.affordance.search import Search, Settings
-from dora.affordance.signed_distance import CHANNELS, SignedDistanceField
-from dora.affordance.structure import AffordanceObject
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.hand.protocol import pregrasp, squeeze
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.objects.signed_distance import CHANNELS, SignedDistanceField
+from dora.affordance.search.cache import forget
+from dora.affordance.search.compiled import CompiledDescent, CompiledEnergy
+from dora.affordance.search.descent import Rows, Schedule
+from dora.affordance.search.energies import GraspEnergy
+from dora.affordance.search.initial_poses import InitialPoses
+from dora.affordance.search.native.parts import PARTS, repeat
+from dora.affordance.search.optimise import optimise, seated, table_of
+from dora.affordance.search.quasi_static_closing import hold
+from dora.affordance.search.search import Search, Settings
 from dora.robot import RobotDescription
 
 NUM = 256

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dora.affordance.structure import AffordanceObject
+from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.digests import digest_of
 from dora.errors import InputError
 from dora.files import read_tensors, write_tensors

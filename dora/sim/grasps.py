@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from dora.affordance.agreement import Agreement, clearly_held
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.energies import Weights
-from dora.affordance.optimise import Settings, optimise
-from dora.affordance.prepared import map_of
-from dora.affordance.protocol import STANDARD, Protocol
-from dora.affordance.structure import AffordanceObject
-from dora.affordance.voting import vote
+from dora.affordance.hand.protocol import STANDARD, Protocol
+from dora.affordance.maps.confusion import Agreement, clearly_held
+from dora.affordance.maps.voting import vote
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.search.cache import map_of
+from dora.affordance.search.energies import Weights
+from dora.affordance.search.optimise import Settings, optimise
 from dora.parallel import warm_up
 from dora.progress import PhaseProgress
 from dora.robot import RobotDescription

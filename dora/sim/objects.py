@@ -11,8 +11,8 @@ from mani_skill.utils.building.actor_builder import ActorBuilder
 from mani_skill.utils.structs import Actor, Pose
 from sapien import physx
 
-from dora.affordance.palette import PALETTE, colours
-from dora.affordance.structure import AffordanceObject
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.views.palette import PALETTE, colours
 from dora.errors import InputError
 from dora.sim.shapes import collision_shape
 

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.protocol import STANDARD
-from dora.affordance.structure import AffordanceObject
+from dora.affordance.hand.protocol import STANDARD
+from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.errors import InputError
 from dora.geometry.rotations import (
     matrix_from_quaternion,

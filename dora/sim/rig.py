@@ -9,7 +9,7 @@ import numpy as np
 import sapien
 from sapien import physx
 
-from dora.affordance.structure import AffordanceObject
+from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.errors import InputError
 from dora.robot import RobotDescription
 from dora.sim.grip import GripReader

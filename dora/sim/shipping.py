@@ -11,15 +11,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dora.affordance.approach import free_approaches
+from dora.affordance.bundled_sets import ROBOT, shipped_path
 from dora.affordance.candidates import GraspCandidates, concatenate
-from dora.affordance.objects import load_object
-from dora.affordance.optimise import OFF_TABLE, Settings, optimise
-from dora.affordance.protocol import STANDARD
-from dora.affordance.reach import Reach
-from dora.affordance.reach_table import Grid, poses
-from dora.affordance.shipped import ROBOT, shipped_path
-from dora.affordance.structure import AffordanceObject
+from dora.affordance.hand.protocol import STANDARD
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.reach.approach_directions import free_approaches
+from dora.affordance.reach.feasibility import Reach
+from dora.affordance.reach.feasibility_table import Grid, poses
+from dora.affordance.search.optimise import OFF_TABLE, Settings, optimise
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.progress import PhaseProgress

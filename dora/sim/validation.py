@@ -1,6 +1,6 @@
 """Validation of grasp candidates by simulation: the hand closes, then gravity pulls in six directions in turn.
 
-docs/validation.md says what is done and why; the numbers are in `dora.affordance.protocol`. Candidates are shared
+docs/validation.md says what is done and why; the numbers are in `dora.affordance.hand.protocol`. Candidates are shared
 out over processes. Each process simulates one after the other in a scene of its own, since a PhysX step of several
 hands takes as long as the steps of each; a candidate that fails makes room for the next at once.
 """
@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.prepared import map_of
-from dora.affordance.protocol import DIRECTIONS, STANDARD, Protocol
-from dora.affordance.structure import AffordanceObject
+from dora.affordance.hand.protocol import DIRECTIONS, STANDARD, Protocol
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.search.cache import map_of
 from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion, quaternion_apply, quaternion_inverse
 from dora.parallel import Progress, run_cases

@@ -15,9 +15,9 @@ from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, 
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.objects import load_object
-from dora.affordance.reach import Reach
-from dora.affordance.reach_table import Grid, ReachTable
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.reach.feasibility import Reach
+from dora.affordance.reach.feasibility_table import Grid, ReachTable
 from dora.sim.properties import ObjectProperties
 from dora.sim.robot import DescribedRobot
 from dora.tasks.choice import Choice

@@ -12,7 +12,7 @@ from sapien.physx import PhysxMaterial
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.reach_table import Grid
+from dora.affordance.reach.feasibility_table import Grid
 from dora.geometry.rotations import quaternion_apply, quaternion_multiply
 from dora.tasks.base import STANDING_DRAWS, DoraEnv
 from dora.tasks.observations import Entry

@@ -13,9 +13,9 @@ from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Actor, Link, Pose
 from torch import Tensor
 
+from dora.affordance.bundled_sets import best_candidates
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.objects import load_object
-from dora.affordance.shipped import best_candidates
+from dora.affordance.objects.catalogue import load_object
 from dora.geometry.rotations import (
     quaternion_from_rotation_vector,
     quaternion_multiply,

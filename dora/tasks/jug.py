@@ -11,13 +11,13 @@ from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Actor
 from torch import Tensor
 
+from dora.affordance.bundled_sets import best_candidates
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.map import AffordanceMap
-from dora.affordance.objects import load_object
-from dora.affordance.reach_table import Grid
-from dora.affordance.shipped import best_candidates
-from dora.affordance.structure import AffordanceObject
-from dora.affordance.voting import vote
+from dora.affordance.maps.affordance_map import AffordanceMap
+from dora.affordance.maps.voting import vote
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.reach.feasibility_table import Grid
 from dora.geometry.rotations import quaternion_apply
 from dora.sim.objects import build_object
 from dora.tasks.base import STANDING_DRAWS, DoraEnv

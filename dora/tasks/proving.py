@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dora.affordance.bundled_sets import data_folder, load_candidates, shipped_path
 from dora.affordance.candidates import GraspCandidates, concatenate
-from dora.affordance.objects import load_object
-from dora.affordance.optimise import OFF_TABLE
-from dora.affordance.shipped import data_folder, load_candidates, shipped_path
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.search.optimise import OFF_TABLE
 from dora.parallel import run_cases
 from dora.tasks import make_task
 from dora.tasks.base import DoraEnv

@@ -1,0 +1,1 @@
+"""The hand as geometry: kinematics, capsules, meshes and the postures around a grasp."""

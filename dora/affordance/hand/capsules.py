@@ -1,0 +1,134 @@
+"""The hand's collision shapes as capsules, spheres on their axes, and points with normals on palmar sides.
+
+All of it is computed once per robot, in numpy, in the frames of the bodies of `dora.affordance.hand.hand_model`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+
+from dora.geometry.rotations import matrix_from_quaternion
+from dora.robot import Shape
+
+SAGITTA = 6e-4
+"""Deepest groove (m) between neighbouring spheres on a capsule's axis."""
+PALMAR_COSINE = 0.6
+"""Contact points have normals within this cosine of the palmar direction of their link."""
+SAMPLE_DENSITY = 1e6
+"""Surface samples per square metre from which contact points are chosen."""
+BURIED = -2e-4
+"""A surface sample deeper than this (m) in another shape of the straight hand is no contact point."""
+
+
+@dataclass(frozen=True, eq=False)
+class Capsule:
+    """Points within `radius` (m) of the segment from `start` to `end` (3,) in the frame of `body`."""
+
+    body: int
+    link: str
+    start: np.ndarray
+    end: np.ndarray
+    radius: float
+
+    def spheres(self, sagitta: float = SAGITTA) -> np.ndarray:
+        """Centres (n, 3) on the axis so close that the spheres' union is nowhere `sagitta` (m) thinner."""
+        length = float(np.linalg.norm(self.end - self.start))
+        spacing = 2 * math.sqrt(sagitta * (2 * self.radius - sagitta))
+        count = math.ceil(length / spacing) + 1 if length > 0 else 1
+        return np.linspace(self.start, self.end, count)
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance (n,) in m of points (n, 3) to the surface."""
+        return np.linalg.norm(points - self.nearest(points), axis=1) - self.radius
+
+    def nearest(self, points: np.ndarray) -> np.ndarray:
+        """Nearest points (n, 3) of the axis."""
+        axis = self.end - self.start
+        share = (points - self.start) @ axis / max(float(axis @ axis), 1e-18)
+        return self.start + np.clip(share, 0.0, 1.0)[:, None] * axis
+
+
+def capsules_of(shape: Shape, body: int, link: str, pose: np.ndarray) -> list[Capsule]:
+    """A shape of `link` as capsules inside it; `pose` (4, 4) places the link in its body.
+
+    Exact for capsules and spheres. A cylinder becomes the longest capsule inside it, a box a row of capsules
+    along its longest side with its smallest half side as radius: only their edges are rounded off.
+    """
+    turn = pose[:3, :3] @ matrix_from_quaternion(torch.tensor(shape.quaternion, dtype=torch.float64)).numpy()
+    center = pose[:3, :3] @ np.asarray(shape.position) + pose[:3, 3]
+    if shape.kind == "box":
+        return _box(np.asarray(shape.size), center, turn, body, link)
+    radius = shape.size[0]
+    half = 0.0 if shape.kind == "sphere" else shape.size[1]
+    if shape.kind == "cylinder":
+        half = max(half - radius, 0.0)
+    reach = turn @ np.array([half, 0.0, 0.0])
+    return [Capsule(body, link, center - reach, center + reach, radius)]
+
+
+def _box(half: np.ndarray, center: np.ndarray, turn: np.ndarray, body: int, link: str) -> list[Capsule]:
+    thin, middle, long = np.argsort(half)
+    radius = float(half[thin])
+    count = math.ceil((half[middle] - radius) / radius) + 1
+    reach = turn[:, long] * (half[long] - radius)
+    rows = np.linspace(-1.0, 1.0, count) if count > 1 else np.zeros(1)
+    offsets = [row * (half[middle] - radius) * turn[:, middle] for row in rows]
+    return [Capsule(body, link, center + offset - reach, center + offset + reach, radius) for offset in offsets]
+
+
+def palmar_points(
+    capsules: Sequence[Capsule], palmar: np.ndarray, count: int, tip: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Up to `count` evenly spread points (n, 3) and outward unit normals (n, 3) on the palmar side of one body.
+
+    Args:
+        capsules: all capsules of the body; points buried in one of them are left out.
+        palmar: unit direction (3,) that the body's inner side faces, in the body's frame.
+        count: number of points wanted.
+        tip: direction (3,) in which the finger ends there; normals may lean towards it.
+    """
+    facing = palmar if tip is None else (palmar + 0.5 * tip) / np.linalg.norm(palmar + 0.5 * tip)
+    found_points, found_normals = [], []
+    for index, capsule in enumerate(capsules):
+        points, normals = _surface(capsule)
+        keep = normals @ facing > PALMAR_COSINE
+        for other_index, other in enumerate(capsules):
+            if other_index != index:
+                keep &= other.distance(points) > BURIED
+        found_points.append(points[keep])
+        found_normals.append(normals[keep])
+    points, normals = np.concatenate(found_points), np.concatenate(found_normals)
+    chosen = farthest_points(points, count)
+    return points[chosen], normals[chosen]
+
+
+def _surface(capsule: Capsule) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) and normals (n, 3) on the surface of a capsule, the same at every call."""
+    axis = capsule.end - capsule.start
+    length = float(np.linalg.norm(axis))
+    mesh = trimesh.creation.capsule(height=length, radius=capsule.radius, count=[16, 16])
+    turn = trimesh.geometry.align_vectors([0, 0, 1], axis / length) if length > 0 else np.eye(4)
+    pose = np.array(turn, dtype=float)
+    pose[:3, 3] = 0.5 * (capsule.start + capsule.end)
+    mesh.apply_transform(pose)
+    count = max(64, int(mesh.area * SAMPLE_DENSITY))
+    points, _ = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
+    center = capsule.nearest(points)
+    normals = (points - center) / np.linalg.norm(points - center, axis=1, keepdims=True)
+    return center + capsule.radius * normals, normals
+
+
+def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices (min(count, n),) of points chosen one by one, each farthest from those before; starts at 0."""
+    chosen = [0]
+    distance = np.linalg.norm(points - points[0], axis=1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)

@@ -1,0 +1,130 @@
+"""The hand as triangles: what every link looks like, and where it is in a posture. For pictures and pages only."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from functools import cache
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from trimesh.visual import ColorVisuals
+
+from dora.affordance.objects.solids import shape_mesh
+from dora.geometry.rotations import matrix_from_quaternion
+from dora.robot import RobotDescription, SerialChain
+
+GAMMA = 2.2
+"""Exponent between the linear colours of a glTF material and what a screen shows."""
+PLAIN = (0.55, 0.57, 0.6)
+"""Colour of a link that has no visual mesh, red, green and blue in 0..1."""
+
+
+class HandMesh:
+    """Meshes of the wrist and every finger link of a robot, in the link frames [m].
+
+    Args:
+        robot: a robot; a link without visual meshes shows its collision shapes.
+
+    Attributes:
+        links: face-coloured mesh by link name.
+    """
+
+    def __init__(self, robot: RobotDescription) -> None:
+        model = robot.model
+        above = len(model.chain(robot.wrist_link))
+        self._wrist = robot.wrist_link
+        self._fingers = []
+        for finger in robot.fingers.values():
+            joints = model.chain(finger.distal)[above:]
+            chain = SerialChain(joints, dtype=torch.float64)
+            children = tuple(joint.child for joint in joints if joint.moves)
+            index = [robot.hand.names.index(name) for name in chain.names]
+            self._fingers.append((chain, children, index))
+        names = [self._wrist, *(link for _, children, _ in self._fingers for link in children)]
+        visuals = _visual_files(robot)
+        self.links = {name: mesh for name in names if (mesh := _link_mesh(robot, name, visuals)) is not None}
+
+    def poses(self, joints: Float[Tensor, "c j"]) -> dict[str, Float[Tensor, "c 4 4"]]:
+        """Pose of every link of `links` in the wrist frame at hand joints [rad] in the robot's order."""
+        q = joints.to(torch.float64)
+        found = {self._wrist: torch.eye(4, dtype=torch.float64).expand(len(q), 4, 4)}
+        for chain, children, index in self._fingers:
+            found |= dict(zip(children, chain.forward(q[:, index]).joints.unbind(1), strict=True))
+        return {name: found[name] for name in self.links}
+
+    def world_poses(
+        self, position: Float[Tensor, "c 3"], quaternion: Float[Tensor, "c 4"], joints: Float[Tensor, "c j"]
+    ) -> dict[str, Float[Tensor, "c 4 4"]]:
+        """The same in the frame in which the wrist has the given poses ([m], wxyz)."""
+        wrist = torch.eye(4, dtype=torch.float64).repeat(len(joints), 1, 1)
+        wrist[:, :3, :3] = matrix_from_quaternion(quaternion.to(torch.float64))
+        wrist[:, :3, 3] = position
+        return {name: wrist @ pose for name, pose in self.poses(joints).items()}
+
+    def posed(
+        self, position: Float[Tensor, "c 3"], quaternion: Float[Tensor, "c 4"], joints: Float[Tensor, "c j"]
+    ) -> list[trimesh.Trimesh]:
+        """One face-coloured mesh per row of the arguments of `world_poses`."""
+        poses = {name: pose.numpy() for name, pose in self.world_poses(position, quaternion, joints).items()}
+        return [
+            joined([self.links[name].copy().apply_transform(pose[row]) for name, pose in poses.items()])
+            for row in range(len(joints))
+        ]
+
+    @property
+    def fingers(self) -> Bool[np.ndarray, " f"]:
+        """Which faces of `posed` are fingers', not the wrist's link."""
+        return np.concatenate([np.full(len(mesh.faces), name != self._wrist) for name, mesh in self.links.items()])
+
+
+def joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """One mesh with the faces and the face colours of all."""
+    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    return trimesh.Trimesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, offsets, strict=False)]),
+        face_colors=np.concatenate([face_colours(mesh) for mesh in meshes]),
+        process=False,
+    )
+
+
+def face_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "f 4"]:
+    """Red, green, blue and opacity of every face of a mesh that has colours, not textures."""
+    return np.asarray(cast(ColorVisuals, mesh.visual).face_colors)
+
+
+def _visual_files(robot: RobotDescription) -> dict[str, list[Path]]:
+    """Files of the visual meshes of each link of the URDF; their origins are the link frames."""
+    files = {}
+    for link in ElementTree.parse(robot.urdf).getroot().findall("link"):
+        meshes = link.findall("visual/geometry/mesh")
+        files[link.get("name")] = [robot.urdf.parent / mesh.get("filename", "") for mesh in meshes]
+    return files
+
+
+def _link_mesh(robot: RobotDescription, link: str, visuals: dict[str, list[Path]]) -> trimesh.Trimesh | None:
+    parts = [part for path in visuals.get(link, []) if path.is_file() for part in _coloured(path)]
+    parts = parts or [_painted(shape_mesh(shape), np.array(PLAIN)) for shape in robot.shapes.get(link, ())]
+    return joined(parts) if parts else None
+
+
+@cache
+def _coloured(path: Path) -> tuple[trimesh.Trimesh, ...]:
+    """Geometries of a mesh file with one colour each, as it looks on a screen."""
+    parts = []
+    for part in cast(list[trimesh.Trimesh], trimesh.load_scene(path).dump()):
+        factor = getattr(getattr(part.visual, "material", None), "baseColorFactor", None)
+        linear = np.full(4, 255) if factor is None else np.asarray(factor)
+        shown = (linear[:3] / 255) ** (1 / GAMMA)
+        parts.append(_painted(part, shown))
+    return tuple(parts)
+
+
+def _painted(mesh: trimesh.Trimesh, color: np.ndarray) -> trimesh.Trimesh:
+    faces = np.tile((np.append(color, 1.0) * 255).astype(np.uint8), (len(mesh.faces), 1))
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, face_colors=faces, process=False)

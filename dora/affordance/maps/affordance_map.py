@@ -1,0 +1,239 @@
+"""The affordance map of an object: surface points with the part to which each belongs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float, Int
+from torch import Tensor
+from trimesh.visual import ColorVisuals
+
+from dora.affordance.maps.nearest_points import NearestTable, RegionField
+from dora.affordance.maps.poisson_disk import sample_evenly
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.views.palette import PALETTE, colours, legend_of
+from dora.affordance.views.rasteriser import Camera, render
+from dora.affordance.views.sheet import Panel, write_sheet
+from dora.errors import InputError
+from dora.files import read_tensors, write_bytes, write_tensors
+
+COUNT = 4096
+"""Surface points of a map."""
+FORMAT = "dora-map 1"
+"""Format and version of a file of a map."""
+VIEWS = ((-1.0, 0.35), (2.4, 0.35))
+"""Azimuth and elevation (rad) of the pictures."""
+PLAIN = (225, 225, 225, 255)
+"""Colour of the surface under the points."""
+DISC_CORNERS, DISC_SHARE, DISC_LIFT = 8, 0.85, 2e-4
+"""Corners of a point's disc, its radius as a share of that with its area, and its distance (m) from the surface."""
+CANDIDATES_PER_NEIGHBOUR, FEWEST_CANDIDATES = 6, 48
+"""Points that a cell of the table knows: this many per neighbour asked for, and at least the second."""
+
+
+@dataclass(frozen=True, eq=False)
+class AffordanceMap:
+    """M_Aff of the paper: P points spread evenly over a surface, each with one label. Object frame, m.
+
+    Attributes:
+        name: of the object.
+        points: (p, 3) (m).
+        normals: (p, 3) unit, outward.
+        areas: (p,) area for which each point stands (m^2).
+        labels: (p,) index into `names`.
+        names: of the regions.
+        mesh: the surface itself (m).
+        face_labels: (f,) index into `names` of every face of `mesh`.
+        digest: of the object's labelled surface.
+    """
+
+    name: str
+    points: Float[Tensor, "p 3"]
+    normals: Float[Tensor, "p 3"]
+    areas: Float[Tensor, " p"]
+    labels: Int[Tensor, " p"]
+    names: tuple[str, ...]
+    mesh: trimesh.Trimesh
+    face_labels: Int[np.ndarray, " f"]
+    digest: str
+    _tables: dict[int, NearestTable] = field(default_factory=dict, repr=False)
+    _fields: dict[int, RegionField] = field(default_factory=dict, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @classmethod
+    def from_object(cls, obj: AffordanceObject, count: int = COUNT, seed: int = 0) -> AffordanceMap:
+        """Sample an object's surface.
+
+        Args:
+            obj: object.
+            count: number of points P.
+            seed: of the random points.
+
+        Raises:
+            InputError: `count` is less than the number of regions.
+        """
+        if count < len(obj.labels):
+            raise InputError(f"{count} points cannot show {len(obj.labels)} regions; ask for {COUNT}.")
+        points, faces, areas = sample_evenly(obj.mesh, count, seed)
+        return cls(
+            name=obj.name,
+            points=torch.from_numpy(points).float(),
+            normals=torch.from_numpy(np.array(obj.mesh.face_normals[faces])).float(),
+            areas=torch.from_numpy(areas).float(),
+            labels=torch.from_numpy(obj.face_labels[faces]).long(),
+            names=obj.labels,
+            mesh=obj.mesh,
+            face_labels=obj.face_labels,
+            digest=obj.digest,
+        )
+
+    @property
+    def spacing(self) -> float:
+        """Typical distance (m) of neighbouring points: that of a hexagonal grid with as many per area."""
+        return float((2 * self.areas.mean() / 3**0.5) ** 0.5)
+
+    def label_index(self, label: str) -> int:
+        """Index of a region.
+
+        Raises:
+            InputError: the map has no such region.
+        """
+        if label not in self.names:
+            raise InputError(f"{self.name} has no region {label!r}; choose one of: {', '.join(self.names)}.")
+        return self.names.index(label)
+
+    def nearest_points(
+        self, queries: Float[Tensor, "*b 3"], k: int
+    ) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
+        """Distances (m), ascending, and indices of the k points nearest to each query (object frame, m); exact.
+
+        Quick for queries within a few spacings of the surface; others are compared with all points. The table
+        behind it is made when k is first asked for.
+
+        Raises:
+            InputError: k is not in 1 .. P.
+        """
+        if not 1 <= k <= len(self):
+            raise InputError(f"{k} neighbours were asked of a map with {len(self)} points; ask for 1 to {len(self)}.")
+        size = max(FEWEST_CANDIDATES, CANDIDATES_PER_NEIGHBOUR * k)
+        if size not in self._tables:
+            self._tables[size] = NearestTable(self.points, self.spacing, size)
+        distance, index = self._tables[size].query(queries.reshape(-1, 3), k)
+        shape = (*queries.shape[:-1], k)
+        return distance.view(shape), index.view(shape)
+
+    def nearest(self, queries: Float[Tensor, "*b 3"], k: int) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
+        """Distances (m), ascending, and labels of the k points nearest to each query; as `nearest_points`."""
+        distance, index = self.nearest_points(queries, k)
+        return distance, self.labels[index]
+
+    def region_distance(self, queries: Float[Tensor, "*b 3"], label: str) -> Float[Tensor, "*b"]:
+        """Unsigned distance (m) of queries (object frame, m) to a region's surface, interpolated on a grid.
+
+        Differentiable; the grid behind it is made when a label is first asked for.
+
+        Raises:
+            InputError: the map has no such region.
+        """
+        index = self.label_index(label)
+        if index not in self._fields:
+            region = trimesh.Trimesh(self.mesh.vertices, self.mesh.faces[self.face_labels == index])
+            self._fields[index] = RegionField(region, self.points.device)
+        return self._fields[index](queries.reshape(-1, 3)).view(queries.shape[:-1])
+
+    def to(self, device: torch.device | str) -> AffordanceMap:
+        """The same map on another device."""
+        moved = {name: value.to(device) for name, value in self._tensors().items()}
+        return replace(self, **moved, _tables={}, _fields={})
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """What moves with `to`."""
+        return {name: getattr(self, name) for name in ("points", "normals", "areas", "labels")}
+
+    def save(self, path: Path | str) -> None:
+        """Write a safetensors file; raises InputError if it cannot be written."""
+        metadata = {"name": self.name, "names": list(self.names), "digest": self.digest}
+        surface = {
+            "vertices": torch.tensor(np.array(self.mesh.vertices)),
+            "faces": torch.tensor(np.array(self.mesh.faces)),
+            "face_labels": torch.tensor(self.face_labels),
+        }
+        write_tensors(Path(path), FORMAT, self._tensors() | surface, metadata)
+
+    def painted(self) -> trimesh.Trimesh:
+        """The surface with each face in the colour of its region (object frame, m)."""
+        rgba = colours(self.face_labels, PALETTE)
+        return trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, face_colors=rgba, process=False)
+
+    def discs(self) -> trimesh.Trimesh:
+        """Every point as a disc as large as the area for which it stands, in the colour of its region."""
+        angle = torch.linspace(0, 2 * torch.pi, DISC_CORNERS + 1)[:-1]
+        first = torch.linalg.cross(self.normals, torch.eye(3)[self.normals.abs().argmin(1)])
+        first = torch.nn.functional.normalize(first, dim=-1)
+        second = torch.linalg.cross(self.normals, first)
+        radius = (self.areas / torch.pi).sqrt()[:, None, None]
+        ring = angle.cos()[:, None] * first[:, None] + angle.sin()[:, None] * second[:, None]
+        corners = (self.points + DISC_LIFT * self.normals)[:, None] + DISC_SHARE * radius * ring
+        fan = torch.tensor([[0, i, i + 1] for i in range(1, DISC_CORNERS - 1)])
+        faces = fan + DISC_CORNERS * torch.arange(len(self))[:, None, None]
+        colors = np.repeat(colours(self.labels.numpy(), PALETTE), len(fan), axis=0)
+        vertices = corners.reshape(-1, 3).numpy()
+        return trimesh.Trimesh(vertices, faces.reshape(-1, 3).numpy(), face_colors=colors, process=False)
+
+    def picture(self, path: Path | str, size: int = 400) -> None:
+        """Write a PNG: the painted surface from the front and from behind, and the points as discs on it.
+
+        Args:
+            path: of the file.
+            size: side of each of the three views (pixels).
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        own = self.to("cpu")
+        plain = trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False)
+        plain.visual = ColorVisuals(plain, face_colors=PLAIN)
+        shown = {
+            "regions, from the front": ([own.painted()], VIEWS[0]),
+            "from behind": ([own.painted()], VIEWS[1]),
+            f"the {len(self)} points of the map": ([plain, own.discs()], VIEWS[0]),
+        }
+        panels = [
+            Panel(render(meshes, Camera.around([self.mesh], *view), size, size), title)
+            for title, (meshes, view) in shown.items()
+        ]
+        write_sheet(panels, path, len(panels), legend_of(self.names), self.name)
+
+    def export_glb(self, path: Path | str) -> None:
+        """Write the painted surface as binary glTF (m), which every 3D viewer shows; raises InputError as `save`."""
+        write_bytes(Path(path), cast(bytes, trimesh.Scene(self.painted()).export(file_type="glb")))
+
+    @classmethod
+    def load(cls, path: Path | str, obj: AffordanceObject | None = None) -> AffordanceMap:
+        """Read what `save` wrote and, if an object is given, check that the map is of its surface.
+
+        Raises:
+            InputError: no such file, damaged, of another format, or of another object.
+        """
+        tensors, metadata = read_tensors(Path(path), FORMAT)
+        if obj is not None and metadata["digest"] != obj.digest:
+            raise InputError(f"{path} is the map of another shape or labelling than {obj.name}: make it again.")
+        vertices, faces, face_labels = (tensors[key].numpy() for key in ("vertices", "faces", "face_labels"))
+        return cls(
+            points=tensors["points"],
+            normals=tensors["normals"],
+            areas=tensors["areas"],
+            labels=tensors["labels"],
+            name=metadata["name"],
+            names=tuple(metadata["names"]),
+            mesh=trimesh.Trimesh(vertices, faces, process=False),
+            face_labels=face_labels,
+            digest=metadata["digest"],
+        )

@@ -1,0 +1,113 @@
+"""The paper's contact semantic map M_CoS: which part of the hand touches each point of an object's surface."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.objects.signed_distance import CHANNELS, SignedDistanceField
+from dora.geometry.rotations import matrix_from_quaternion
+
+TOUCH = 5e-3
+"""Distance (m) between hand and surface below which they are in contact."""
+CHUNK = 2_000_000
+"""Point-capsule pairs measured at once, which bounds memory."""
+
+
+def contact_semantic_map(
+    points: Float[Tensor, "p 3"],
+    position: Float[Tensor, "c 3"],
+    quaternion: Float[Tensor, "c 4"],
+    joints: Float[Tensor, "c j"],
+    hand: HandModel,
+    touch: float = TOUCH,
+) -> Int[Tensor, "c p"]:
+    """M_CoS(p_i) = the part of the hand whose links are nearest to p_i, or 0 if farther than `touch`.
+
+    Args:
+        points: of the object's surface (object frame, m).
+        position: of the wrist in the object frame (m).
+        quaternion: of the wrist in the object frame, wxyz.
+        joints: all hand joints (rad), in the order of `RobotDescription.hand`.
+        hand: the hand.
+        touch: largest distance (m) of a contact; points inside the hand are in contact.
+
+    Returns:
+        0 no contact, 1 palm, 2 thumb, 3 index, 4 middle, 5 ring, 6 pinky.
+    """
+    wrist = wrist_matrix(position.to(hand.lower), quaternion.to(hand.lower))
+    poses = hand.forward(wrist, hand.robot.reduce_hand(joints.to(hand.lower)))
+    ends = hand.place(poses, hand.ends)
+    part = hand.part[hand.ends.body[0::2]]
+    rows = max(1, CHUNK // (len(points) * len(part)))
+    found = [
+        _nearest_part(points.to(hand.lower), chunk[:, 0::2], chunk[:, 1::2], hand.radius, part, touch)
+        for chunk in ends.split(rows)
+    ]
+    return torch.cat(found)
+
+
+def _nearest_part(points: Tensor, start: Tensor, end: Tensor, radius: Tensor, part: Tensor, touch: float) -> Tensor:
+    """Contact class (c, p) of points (p, 3) among capsules with axes `start`, `end` (c, k, 3)."""
+    axis = end - start
+    square = axis.square().sum(-1).clamp_min(torch.finfo(axis.dtype).tiny)
+    along = torch.einsum("pi,cki->cpk", points, axis) - (start * axis).sum(-1).unsqueeze(1)
+    share = (along / square.unsqueeze(1)).clamp(0, 1)
+    nearest = start.unsqueeze(1) + share.unsqueeze(-1) * axis.unsqueeze(1)
+    gap = (points[:, None] - nearest).norm(dim=-1) - radius
+    distance, capsule = gap.min(-1)
+    return torch.where(distance < touch, part[capsule], 0)
+
+
+def hand_contacts(
+    hand: HandModel, field: SignedDistanceField, poses: Float[Tensor, "c b 4 4"], touch: float = TOUCH
+) -> tuple[Float[Tensor, "c k 3"], Int[Tensor, "c k"]]:
+    """Contact points on the object, the nearest one of every link of the hand, and their contact classes.
+
+    Args:
+        hand: the hand.
+        field: of the object.
+        poses: of `HandModel.forward`, in the object frame.
+        touch: links farther than this (m) have class 0.
+    """
+    points = hand.place(poses, hand.contacts)
+    bodies, counts = torch.unique_consecutive(hand.contacts.body, return_counts=True)
+    distance = field.distance(points)
+    nearest = [part.argmin(1) for part in distance.split(counts.tolist(), 1)]
+    index = torch.stack(nearest, 1) + (counts.cumsum(0) - counts)
+    chosen = torch.take_along_dim(points, index.unsqueeze(-1), 1)
+    value, _ = field.sample(chosen.view(-1, 3), CHANNELS)
+    onto = (chosen.view(-1, 3) - value[:, :1] * value[:, 1:]).view_as(chosen)
+    touching = torch.take_along_dim(distance, index, 1) < touch
+    return onto, torch.where(touching, hand.part[bodies], 0)
+
+
+def pressed_contacts(
+    hand: HandModel, field: SignedDistanceField, poses: Float[Tensor, "c b 4 4"]
+) -> tuple[Float[Tensor, "c k 3"], Int[Tensor, "c k"]]:
+    """Contact points on the object of every sphere of the hand that overlaps with it, and their contact classes.
+
+    Rows are filled up with points of class 0 to the largest number of contacts.
+
+    Args:
+        hand: the hand.
+        field: of the object.
+        poses: of `HandModel.forward` of the closed hand, in the object frame.
+    """
+    centers = hand.place(poses, hand.spheres)
+    value, _ = field.sample(centers.flatten(0, 1), CHANNELS)
+    onto = centers - (value[:, :1] * value[:, 1:]).view_as(centers)
+    pressed = value[:, 0].view(centers.shape[:2]) < hand.sphere_radius
+    first = pressed.int().argsort(dim=1, descending=True, stable=True)[:, : int(pressed.sum(1).max())]
+    part = torch.where(pressed, hand.part[hand.spheres.body], 0)
+    return torch.take_along_dim(onto, first.unsqueeze(-1), 1), part.gather(1, first)
+
+
+def wrist_matrix(position: Float[Tensor, "c 3"], quaternion: Float[Tensor, "c 4"]) -> Float[Tensor, "c 4 4"]:
+    """Homogeneous pose of a position (m) and a quaternion (wxyz)."""
+    pose = torch.eye(4, dtype=position.dtype, device=position.device).repeat(len(position), 1, 1)
+    pose[:, :3, :3] = matrix_from_quaternion(quaternion)
+    pose[:, :3, 3] = position
+    return pose

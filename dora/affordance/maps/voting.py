@@ -1,0 +1,87 @@
+"""The paper's voting: which part of an object a hand holds, from its contacts and the affordance map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dora.affordance.maps.affordance_map import AffordanceMap
+from dora.errors import InputError
+
+HAND_PARTS = 6
+"""Parts of a hand that vote: palm and up to five fingers, contact classes 1 to 6; class 0 is no contact."""
+NO_CONTACT = -1
+"""Result of a vote without any contact."""
+
+
+@dataclass(frozen=True)
+class VotingSettings:
+    """Settings of the vote.
+
+    Attributes:
+        neighbours: N, labels looked up per contact.
+        weights: w_f of palm, thumb, index, middle, ring and pinky.
+    """
+
+    neighbours: int = 8
+    weights: tuple[float, ...] = (1.0, 2.0, 1.0, 1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if self.neighbours < 1:
+            raise InputError(f"a vote needs at least 1 neighbour per contact, not {self.neighbours}.")
+        if len(self.weights) != HAND_PARTS or not all(weight > 0 for weight in self.weights):
+            raise InputError(f"a vote needs {HAND_PARTS} positive weights: palm, thumb and the other fingers.")
+
+
+STANDARD = VotingSettings()
+"""Settings of every number in the docs."""
+
+
+def vote(
+    map: AffordanceMap,
+    contacts: Float[Tensor, "b k 3"],
+    finger: Int[Tensor, "b k"],
+    settings: VotingSettings = STANDARD,
+) -> Int[Tensor, " b"]:
+    """Index into `map.names` of the part that is held; -1 where there is no contact at all.
+
+    The paper's equations, with M = 6 parts of the hand (the palm counts as one):
+
+    1. N(p_i) = the labels of the N points of the map nearest to contact p_i;
+    2. A_f = mode of the union (with multiplicity) of N(p_i) over the contacts of part f;
+    3. A = argmax_a sum_f w_f [A_f = a].
+
+    Parts without contact do not vote. Ties, which the paper leaves open: of labels equally frequent at one
+    part, and of labels with equal sums of weights, the one wins that is more frequent among the neighbours
+    of all contacts together; if that is equal too, the one named first in the map.
+
+    Args:
+        map: affordance map.
+        contacts: points in the object frame (m).
+        finger: contact class of every point: 0 none (its point is not looked at), 1 palm, 2 thumb ... 6 pinky.
+        settings: N and the weights.
+    """
+    labels = len(map.names)
+    touching = (finger > 0) & (finger <= HAND_PARTS)
+    where = torch.where(touching.unsqueeze(-1), contacts, map.points[0].to(contacts))
+    _, near = map.nearest(where, settings.neighbours)
+    cell = (finger.clamp(0, HAND_PARTS) * labels).unsqueeze(-1) + near
+    counts = contacts.new_zeros(len(contacts), (HAND_PARTS + 1) * labels)
+    counts.scatter_add_(1, cell.flatten(1), torch.ones_like(cell, dtype=counts.dtype).flatten(1))
+    counts = counts.unflatten(1, (HAND_PARTS + 1, labels))[:, 1:]
+    overall = counts.sum(1, keepdim=True)
+    preference = overall / (overall.sum(-1, keepdim=True) + 1)
+    choice = (counts + preference * (counts > 0)).argmax(-1)
+    voting = counts.sum(-1) > 0
+    weights = torch.where(voting, counts.new_tensor(settings.weights), 0.0)
+    sums = counts.new_zeros(len(counts), labels).scatter_add_(1, choice, weights)
+    smallest = min(settings.weights)
+    held = (sums + preference.squeeze(1) * _TIE * smallest).argmax(-1)
+    return torch.where(voting.any(-1), held, NO_CONTACT)
+
+
+_TIE = 1e-3
+"""Share of the smallest weight by which all neighbours together may move a sum: it settles ties only."""

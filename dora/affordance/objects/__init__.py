@@ -1,0 +1,1 @@
+"""Objects as data: ours, those of users, and what is computed from their surfaces."""

@@ -1,0 +1,183 @@
+"""Objects of users: any mesh that trimesh reads, repaired, scaled, labelled and cut into convex pieces."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from dora.affordance.objects.affordance_object import UPRIGHT, AffordanceObject, Piece, assemble
+from dora.affordance.objects.decomposition import THRESHOLD, decompose
+from dora.affordance.objects.labels import WHOLE, FaceLabels, grasp_class, read_labels
+from dora.affordance.objects.surface_repair import repair
+from dora.errors import InputError
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Metres per unit of length."""
+SMALLEST, LARGEST = 0.005, 2.0
+"""Longest side (m) of an object that a hand could meet."""
+MOST_FACES = 200_000
+DENSITY = 600.0
+"""Density (kg/m^3), of wood, where no mass is given."""
+STABLE = 0.002
+"""An object stands as modelled if its centre of mass is at least this far (m) inside the outline of its foot."""
+
+
+def import_object(
+    path: Path | str,
+    labels: Path | str | None = None,
+    scale: float = 1.0,
+    units: str = "m",
+    mass: float | None = None,
+    threshold: float = THRESHOLD,
+    cache_dir: Path | str | None = None,
+) -> AffordanceObject:
+    """An object from a file. Axes are kept, the origin moves to the centre of mass.
+
+    Args:
+        path: OBJ, STL, PLY, GLB, OFF or another format of trimesh. Several bodies are united.
+        labels: see `dora.affordance.objects.labels.read_labels`; if None, the parts are the named bodies of the file, else
+            its materials, else the whole.
+        scale: factor of all lengths.
+        units: of the file, one of `UNITS`; glTF files are in m.
+        mass: kg; that of wood if None.
+        threshold: of the convex decomposition, see `dora.affordance.objects.decomposition.decompose`.
+        cache_dir: where the decomposition is kept.
+
+    Raises:
+        InputError: the file cannot be read, is empty, not finite, cannot be closed, has too many faces or an absurd
+            size, or the labels do not fit.
+    """
+    path = Path(path)
+    if units not in UNITS:
+        raise InputError(f"the unit {units!r} is unknown; use --units with one of: {', '.join(UNITS)}.")
+    for name, value in (("scale", scale), ("mass", 1.0 if mass is None else mass)):
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"the {name} of {path} is {value}; give a positive number.")
+    raw, names = read_mesh(path, keep_order=labels is not None)
+    _check_size(raw, path, scale * UNITS[units])
+    given = FaceLabels.from_names(names) if labels is None else read_labels(Path(labels), raw.triangles_center)
+    raw = trimesh.Trimesh(raw.vertices * (scale * UNITS[units]), raw.faces, process=False)
+    repaired = repair(raw, given.index, str(path))
+    mesh = repaired.mesh
+    kept = [i for i in range(len(given.names)) if (repaired.labels == i).any()]
+    index = np.searchsorted(kept, repaired.labels)
+    regions = {given.names[i]: grasp_class(given.names[i]) for i in kept}
+    if given.target not in regions:
+        raise InputError(f"the region {given.target!r} of {path} lies inside other parts; choose another target.")
+    hulls = decompose(mesh, threshold, cache_dir)
+    return assemble(
+        path.stem,
+        mesh,
+        index,
+        regions,
+        given.target,
+        weights=[(mesh, float(mesh.volume) * DENSITY if mass is None else mass)],
+        pieces=[Piece(tuple(regions)[_label_of(hull, mesh, index)], hull) for hull in hulls],
+        rest=resting_pose(mesh),
+    )
+
+
+def read_mesh(path: Path, keep_order: bool = False) -> tuple[trimesh.Trimesh, list[str]]:
+    """All triangles of a file in one mesh, and for each the name of its part.
+
+    Args:
+        path: of the file.
+        keep_order: keep the faces of an OBJ file in their order, and do without the names.
+
+    Raises:
+        InputError: it cannot be read, holds no triangles, too many, or coordinates that are not finite.
+    """
+    if not path.is_file():
+        raise InputError(f"there is no mesh file {path}.")
+    scene = _load(
+        path,
+        {"maintain_order": True, "skip_materials": True}
+        if keep_order
+        else {"split_objects": True, "group_material": False},
+    )
+    parts = _parts(scene)
+    if path.suffix.lower() == ".obj" and not keep_order and len(parts) == 1:
+        parts = _parts(_load(path, {}))
+    if not parts:
+        raise InputError(f"{path} holds no triangles: export the surface of the object as a triangle mesh.")
+    mesh = cast(trimesh.Trimesh, trimesh.util.concatenate([part for _, part in parts]))
+    if len(mesh.faces) > MOST_FACES:
+        raise InputError(f"{path} has {len(mesh.faces)} faces; reduce it to at most {MOST_FACES} in a mesh editor.")
+    if not np.isfinite(mesh.vertices).all():
+        raise InputError(f"{path} has coordinates that are not finite; export it again.")
+    return mesh, [name for name, part in parts for _ in range(len(part.faces))]
+
+
+def _load(path: Path, options: dict[str, Any]) -> trimesh.Scene:
+    """What trimesh reads; `options` are for OBJ files alone."""
+    own = options if path.suffix.lower() == ".obj" else {}
+    try:
+        return trimesh.load_scene(path, process=False, **own)
+    except Exception as error:  # the readers of some twenty formats raise whatever they meet
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path} cannot be read ({reason}): export it as OBJ, STL, PLY or GLB.") from error
+
+
+def _parts(scene: trimesh.Scene) -> list[tuple[str, trimesh.Trimesh]]:
+    """Triangle meshes of a scene in its frame with their names: of bodies if these differ, else of materials."""
+    placed, order = [], {name: i for i, name in enumerate(scene.geometry)}
+    for node in sorted(scene.graph.nodes_geometry, key=lambda node: (order[scene.graph[node][1]], node)):
+        pose, name = scene.graph[node]
+        part = scene.geometry[name]
+        if isinstance(part, trimesh.Trimesh) and len(part.faces):
+            material = getattr(getattr(part.visual, "material", None), "name", None)
+            placed.append((name, material or name, part.copy().apply_transform(pose)))
+    bodies = {_without_number(name) for name, _, _ in placed}
+    materials = {material for _, material, _ in placed}
+    if len(bodies) > 1:
+        return [(name, part) for name, _, part in placed]
+    if len(materials) > 1:
+        return [(material, part) for _, material, part in placed]
+    return [(WHOLE, part) for _, _, part in placed]
+
+
+def _without_number(name: str) -> str:
+    """A name without the number that editors add to copies: "part.001" -> "part"."""
+    return re.sub(r"[._ -]?\d+$", "", name)
+
+
+def _check_size(mesh: trimesh.Trimesh, path: Path, factor: float) -> None:
+    """Refuse what cannot be held, most often because of the wrong unit."""
+    longest = float(mesh.extents.max()) * factor
+    if not SMALLEST <= longest <= LARGEST:
+        raise InputError(
+            f"{path} would be {longest:.3g} m long, not {SMALLEST} to {LARGEST} m: "
+            f"say in what units it is with --units ({', '.join(UNITS)}), or give --scale."
+        )
+
+
+def _label_of(hull: trimesh.Trimesh, mesh: trimesh.Trimesh, index: np.ndarray) -> int:
+    """The label with the most surface in or near a hull."""
+    planes, offsets = hull.face_normals, np.einsum("nd,nd->n", hull.face_normals, hull.triangles[:, 0])
+    apart = (mesh.triangles_center @ planes.T - offsets).max(1)
+    near = apart <= max(0.02 * hull.scale, apart.min())
+    return int(np.bincount(index[near], weights=mesh.area_faces[near]).argmax())
+
+
+def resting_pose(mesh: trimesh.Trimesh) -> tuple[float, float, float, float]:
+    """Orientation (wxyz) in which an object rests on a table: as modelled if that is stable, else the likeliest."""
+    if _stands(mesh):
+        return UPRIGHT
+    with np.errstate(invalid="ignore"):
+        poses, _ = trimesh.poses.compute_stable_poses(mesh)
+    w, x, y, z = (float(v) for v in trimesh.transformations.quaternion_from_matrix(poses[0]))
+    return w, x, y, z
+
+
+def _stands(mesh: trimesh.Trimesh) -> bool:
+    """Whether the centre of mass is above the lowest points, and not at their edge."""
+    z = mesh.vertices[:, 2]
+    foot: Float[np.ndarray, "n 2"] = mesh.vertices[z < z.min() + STABLE / 4][:, :2] - mesh.center_mass[:2]
+    around = np.arange(0, 2 * np.pi, 0.1)
+    directions = np.stack([np.cos(around), np.sin(around)])
+    return bool(((foot @ directions).max(0) > STABLE).all())

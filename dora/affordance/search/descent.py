@@ -1,0 +1,95 @@
+"""Descent on the grasp energy by Adam, of many candidates at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dora.affordance.search.energies import RAMPED, Evaluation, GraspEnergy
+from dora.geometry.rotations import matrix_from_rotation_vector
+
+MEAN_DECAY, SQUARE_DECAY = 0.9, 0.98
+"""Adam's decay rates."""
+SMALLEST = 1e-8
+"""What Adam adds to the root of the mean square of the gradient."""
+
+
+@dataclass
+class Rows:
+    """Candidates under search.
+
+    `wrist` (c, 4, 4) in the object frame, `joints` (c, a) in rad, `contacts` (c, k) indices of contact points,
+    `mean` and `square` (c, 6 + a) Adam's moments, `total` (c,) energy and `overlap` (c,) sum of the terms `RAMPED` (m)
+    when last looked at.
+    """
+
+    wrist: Tensor
+    joints: Tensor
+    contacts: Tensor
+    mean: Tensor
+    square: Tensor
+    total: Tensor
+    overlap: Tensor
+
+    @classmethod
+    def begin(cls, wrist: Tensor, joints: Tensor, contacts: Tensor, total: Tensor) -> Rows:
+        """Rows that have not moved yet."""
+        mean = joints.new_zeros(len(joints), 6 + joints.shape[1])
+        return cls(wrist, joints, contacts, mean, torch.zeros_like(mean), total, torch.zeros_like(total))
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def select(self, index: Tensor) -> Rows:
+        """The rows of an index or a mask."""
+        return Rows(*(getattr(self, part.name)[index] for part in fields(self)))
+
+    @staticmethod
+    def join(parts: list[Rows]) -> Rows:
+        """Rows of several parts, in their order."""
+        return Rows(*(torch.cat([getattr(rows, part.name) for rows in parts]) for part in fields(Rows)))
+
+
+class Schedule(NamedTuple):
+    """Steps to take: how many were taken `before`, and for each the factor on `RAMPED` and the share of the largest
+    step."""
+
+    before: int
+    ramp: list[float]
+    size: list[float]
+
+
+class Descent:
+    """Takes steps of Adam; rotations move along their tangent.
+
+    Args:
+        energy: what is to fall.
+        largest: (6 + a,) largest steps of translation (m), rotation (rad) and joints (rad).
+    """
+
+    def __init__(self, energy: GraspEnergy, largest: Float[Tensor, " m"]) -> None:
+        self.energy, self.largest = energy, largest
+
+    def __call__(self, rows: Rows, schedule: Schedule) -> None:
+        """Move rows; `total` and `overlap` become those before the last step."""
+        for step, (ramp, size) in enumerate(zip(schedule.ramp, schedule.size, strict=True), schedule.before + 1):
+            found = self.energy(rows.wrist, rows.joints, rows.contacts, ramp)
+            rows.total, rows.overlap = found.total, overlap(found)
+            gradient = torch.cat((found.wrist, found.joints), 1)
+            rows.mean.lerp_(gradient, 1 - MEAN_DECAY)
+            rows.square.lerp_(gradient.square(), 1 - SQUARE_DECAY)
+            mean = rows.mean / (1 - MEAN_DECAY**step)
+            root = (rows.square / (1 - SQUARE_DECAY**step)).sqrt_().add_(SMALLEST)
+            move = -size * self.largest * mean / root
+            rows.wrist[:, :3, 3] += move[:, :3]
+            rows.wrist[:, :3, :3] = matrix_from_rotation_vector(move[:, 3:6]) @ rows.wrist[:, :3, :3]
+            rows.joints += move[:, 6:]
+
+
+def overlap(found: Evaluation) -> Float[Tensor, " c"]:
+    """Sum of the terms that have to vanish in the end (m)."""
+    return torch.stack([found.terms[name] for name in RAMPED if name in found.terms]).sum(0)

@@ -1,0 +1,295 @@
+"""The grasp energy E = E_DFC + E_HO + E_Robot, every term named, weighted and with its exact gradient.
+
+| term | part | value |
+|---|---|---|
+| closure | E_DFC | ||G c||^2 at the hand's contact points, c the object's inward normals there |
+| distance | E_HO | sum over contact points of abs(signed distance) (m), times `PALM_IMPORTANCE` for the palm |
+| region | E_HO | sum over contact points of the distance to the region to be held (m) |
+| closing | E_HO | sum over contact points on fingers of their miss when the hand closes a little (m) |
+| penetration | E_HO | sum over the hand's spheres of their overlap with the object and a thin skin around it (m) |
+| table | E_HO | sum over the spheres of their depth below the table plus a clearance (m) |
+| limits | E_Robot | sum over the joints of the angle beyond a limit (rad) |
+| self_penetration | E_Robot | sum over pairs of capsules that may collide of their overlap (m) |
+
+All positions are in the object frame. A term yields its value per candidate and forces dE/dp on points of
+the hand; the principle of virtual work (`HandModel.pull_back`) turns those into the gradient with respect
+to wrist and joints. No automatic differentiation is involved, and only points that touch cost anything.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.hand.protocol import STANDARD, flexion
+from dora.affordance.objects.signed_distance import CHANNELS, SignedDistanceField
+
+LENGTH = 0.1
+"""Unit of length (m) of the positions psi in G, so that force and torque have comparable size."""
+CLEARANCE = 3e-3
+"""Distance (m) that the hand keeps from the table."""
+PALM_IMPORTANCE = 3.0
+"""Factor on the distance of contact points on the palm: it cannot close towards the object as fingers do."""
+CLOSING = 0.25
+"""Share of the protocol's squeeze by which the term `closing` closes the hand."""
+PRESS = 2e-3
+"""Depth (m) in the object that a contact point should reach then."""
+SKIN = 7e-4
+"""Overlap (m) is counted from this far outside the surface: what spheres and interpolation miss."""
+_SMALL = 1e-9
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weight of every term, per unit of the term; `docs/grasps.md` says why these."""
+
+    closure: float = 2.0
+    distance: float = 100.0
+    region: float = 50.0
+    closing: float = 100.0
+    penetration: float = 600.0
+    table: float = 300.0
+    limits: float = 10.0
+    self_penetration: float = 200.0
+
+
+TERMS = tuple(field.name for field in fields(Weights))
+"""Names of the terms."""
+RAMPED = ("penetration", "table", "self_penetration")
+"""Terms whose weight grows while a search converges: they have to vanish in the end."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """The table as a half space of the object frame: height(p) = normal . p + offset, m above it."""
+
+    normal: tuple[float, float, float]
+    offset: float
+
+
+class Push(NamedTuple):
+    """Forces dE/dp (n, 3) on points (n, 3) fixed to `body` (n,) of candidate `row` (n,)."""
+
+    row: Int[Tensor, " n"]
+    body: Int[Tensor, " n"]
+    point: Float[Tensor, "n 3"]
+    force: Float[Tensor, "n 3"]
+
+
+class Evaluation(NamedTuple):
+    """Weighted sum `total` (c,), unweighted `terms`, and the gradient of `total`.
+
+    `wrist` (c, 6): with respect to the wrist's translation (m) and rotation vector (rad) about its origin,
+    both in the object frame; `joints` (c, a): with respect to the actuated joints (rad).
+    """
+
+    total: Float[Tensor, " c"]
+    terms: dict[str, Float[Tensor, " c"]]
+    wrist: Float[Tensor, "c 6"]
+    joints: Float[Tensor, "c a"]
+
+
+class GraspEnergy:
+    """E of candidates of one object.
+
+    Args:
+        hand: the hand.
+        field: the object, with a region channel if a region is to be held.
+        weights: of the terms.
+        table: what the object rests on; None if it is free.
+    """
+
+    def __init__(
+        self, hand: HandModel, field: SignedDistanceField, weights: Weights | None = None, table: Table | None = None
+    ) -> None:
+        self.hand, self.field, self.table = hand, field, table
+        self.weights = weights or Weights()
+        start, end = hand.ends.local[0::2], hand.ends.local[1::2]
+        bound = 0.5 * (end - start).norm(dim=-1) + hand.radius
+        self._bound = torch.full((len(bound), len(bound)), -torch.inf, dtype=hand.dtype, device=hand.device)
+        first, second = hand.pairs.unbind(1)
+        self._bound[first, second] = (bound[first] + bound[second]).square()
+        self._capsule_body = hand.ends.body[0::2]
+        self._skin = hand.sphere_radius + SKIN
+        self._close = hand.lower.new_tensor(CLOSING * STANDARD.squeeze * hand.robot.reduce_hand(flexion(hand.robot)))
+        self._has_region = field.table.shape[1] > CHANNELS
+
+    def __call__(
+        self,
+        wrist: Float[Tensor, "c 4 4"],
+        joints: Float[Tensor, "c a"],
+        contacts: Int[Tensor, "c k"],
+        ramp: float = 1.0,
+    ) -> Evaluation:
+        """Evaluate.
+
+        Args:
+            wrist: pose of the wrist in the object frame.
+            joints: actuated joints, rad.
+            contacts: indices into `hand.contacts` of the points that should touch.
+            ramp: factor on the weights of `RAMPED`.
+        """
+        poses = self.hand.forward(wrist, joints)
+        closed = self.hand.forward(wrist, joints + self._close)
+        found = self.contact_terms(poses, contacts)
+        found |= self.sphere_terms(poses)
+        found["self_penetration"] = self.self_penetration(poses)
+        terms = {name: value for name, (value, _) in found.items()}
+        terms["limits"], slope = self.limits(joints)
+        terms["closing"], push = self.closing(closed, contacts)
+        factor = {name: getattr(self.weights, name) * (ramp if name in RAMPED else 1.0) for name in TERMS}
+        pushes = [push._replace(force=factor[name] * push.force) for name, (_, push) in found.items()]
+        wrench = assemble(len(wrist), poses.shape[1], pushes)
+        wrist_gradient, joint_gradient = self.hand.pull_back(poses, wrench)
+        wrench = assemble(len(wrist), poses.shape[1], [push._replace(force=factor["closing"] * push.force)])
+        wrist_closed, joint_closed = self.hand.pull_back(closed, wrench)
+        total = torch.stack([factor[name] * value for name, value in terms.items()]).sum(0)
+        joint_gradient = joint_gradient + joint_closed + factor["limits"] * slope
+        return Evaluation(total, terms, wrist_gradient + wrist_closed, joint_gradient)
+
+    def weighted(self, weights: Weights) -> GraspEnergy:
+        """The same energy with other weights."""
+        other = copy(self)
+        other.weights = weights
+        return other
+
+    def contact_points(
+        self, poses: Float[Tensor, "c b 4 4"], contacts: Int[Tensor, "c k"]
+    ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, "n 3"]]:
+        """Row, body and position (m) of n = c k contact points."""
+        count, each = contacts.shape
+        row = torch.arange(count, device=contacts.device).repeat_interleave(each)
+        body = self.hand.contacts.body[contacts].flatten()
+        pose = poses[row, body]
+        local = self.hand.contacts.local[contacts].view(-1, 3, 1)
+        return row, body, (pose[:, :3, :3] @ local).squeeze(-1) + pose[:, :3, 3]
+
+    def closing(self, poses: Float[Tensor, "c b 4 4"], contacts: Int[Tensor, "c k"]) -> tuple[Tensor, Push]:
+        """Sum over contact points on fingers of (distance + `PRESS`)+ where `poses` are those of a closed hand."""
+        row, body, point = self.contact_points(poses, contacts)
+        value, slope = self.field.sample(point, 1)
+        miss = (value[:, 0] + PRESS) * (body > 0)
+        force = slope[:, 0] * (miss > 0).unsqueeze(1)
+        return miss.clamp_min(0).view(contacts.shape).sum(1), Push(row, body, point, force)
+
+    def contact_terms(
+        self, poses: Float[Tensor, "c b 4 4"], contacts: Int[Tensor, "c k"]
+    ) -> dict[str, tuple[Tensor, Push]]:
+        """closure, distance and region: what asks the hand to touch, and where."""
+        count, each = contacts.shape
+        row, body, point = self.contact_points(poses, contacts)
+        value, slope = self.field.sample(point)
+        terms = {"closure": self._closure(point, value, slope, count, each)}
+        importance = torch.where(body == 0, PALM_IMPORTANCE, 1.0).to(value)
+        pull = (importance * value[:, 0].sign()).unsqueeze(1) * slope[:, 0]
+        terms["distance"] = (importance * value[:, 0].abs()).view(count, each).sum(1), pull
+        if self._has_region:
+            terms["region"] = value[:, CHANNELS].view(count, each).sum(1), slope[:, CHANNELS]
+        return {name: (term, Push(row, body, point, force)) for name, (term, force) in terms.items()}
+
+    def _closure(self, point: Tensor, value: Tensor, slope: Tensor, count: int, each: int) -> tuple[Tensor, Tensor]:
+        """||G c||^2 (c,) and its derivative (c k, 3) with respect to the contact points."""
+        raw = value[:, 1:CHANNELS]
+        length = raw.norm(dim=-1, keepdim=True).clamp_min(_SMALL)
+        inward = (-raw / length).view(count, each, 3)
+        arm = (point / LENGTH).view(count, each, 3)
+        force, torque = net_wrench(arm, inward)
+        by_normal = 2 * (force.unsqueeze(1) + torch.linalg.cross(torque.unsqueeze(1), arm)).view(-1, 3)
+        unit = inward.view(-1, 3)
+        by_raw = -(by_normal - unit * (unit * by_normal).sum(-1, keepdim=True)) / length
+        by_point = 2 / LENGTH * torch.linalg.cross(inward, torque.unsqueeze(1)).view(-1, 3)
+        by_point = by_point + (by_raw.unsqueeze(1) @ slope[:, 1:CHANNELS]).squeeze(1)
+        return force.square().sum(-1) + torque.square().sum(-1), by_point
+
+    def sphere_terms(self, poses: Float[Tensor, "c b 4 4"]) -> dict[str, tuple[Tensor, Push]]:
+        """penetration and table: what keeps the hand's spheres out of things."""
+        hand = self.hand
+        centers = hand.place(poses, hand.spheres)
+        terms = {}
+        touching = self.field.may_touch(centers, self._skin)
+        points = centers.view(-1, 3)[touching]
+        value, slope = self.field.sample(points, 1)
+        depth = self._skin[touching % len(self._skin)] - value[:, 0]
+        terms["penetration"] = self._overlap(touching, points, depth, -slope[:, 0], len(poses))
+        if self.table is not None:
+            normal = centers.new_tensor(self.table.normal)
+            depth = (hand.sphere_radius + (CLEARANCE - self.table.offset)) - centers @ normal
+            below = (depth > 0).flatten().nonzero().squeeze(1)
+            points = centers.view(-1, 3)[below]
+            terms["table"] = self._overlap(below, points, depth.flatten()[below], -normal.expand_as(points), len(poses))
+        return terms
+
+    def _overlap(self, flat: Tensor, points: Tensor, depth: Tensor, slope: Tensor, count: int) -> tuple[Tensor, Push]:
+        """Sum of positive depths of spheres with flat indices into (c, s); `slope` is d depth / d point."""
+        spheres = len(self.hand.sphere_radius)
+        row = flat // spheres
+        value = depth.new_zeros(count).index_add_(0, row, depth.clamp_min(0))
+        return value, Push(row, self.hand.spheres.body[flat % spheres], points, slope * (depth > 0).unsqueeze(1))
+
+    def self_penetration(self, poses: Float[Tensor, "c b 4 4"]) -> tuple[Tensor, Push]:
+        """Sum over pairs of capsules of (r_a + r_b - distance of their axes)+."""
+        row, pair, first, second, gap = self.close_pairs(poses)
+        overlap = -gap.clamp_max(0)
+        value = overlap.new_zeros(len(poses)).index_add_(0, row, overlap)
+        away = first - second
+        force = -away / away.norm(dim=-1, keepdim=True).clamp_min(_SMALL) * (gap < 0).unsqueeze(1)
+        body = self._capsule_body[pair].flatten()
+        return value, Push(row.repeat(2), body, torch.cat((first, second)), torch.cat((force, -force)))
+
+    def close_pairs(
+        self, poses: Float[Tensor, "c b 4 4"]
+    ) -> tuple[Int[Tensor, " n"], Int[Tensor, "2 n"], Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+        """Pairs of capsules that may overlap: row, capsules, nearest points of their axes, gap of surfaces (m)."""
+        ends = self.hand.place(poses, self.hand.ends)
+        ends = ends - poses[:, None, 0, :3, 3]
+        middle = 0.5 * (ends[:, 0::2] + ends[:, 1::2])
+        square = middle.square().sum(-1)
+        apart = torch.baddbmm(square.unsqueeze(1) + square.unsqueeze(2), middle, middle.mT, alpha=-2)
+        row, a, b = (apart < self._bound).nonzero().unbind(1)
+        ends = ends + poses[:, None, 0, :3, 3]
+        flat, first, second = ends.flatten(0, 1), 2 * (row * middle.shape[1] + a), 2 * (row * middle.shape[1] + b)
+        near = segment_points(flat[first], flat[first + 1], flat[second], flat[second + 1])
+        gap = (near[0] - near[1]).norm(dim=-1) - self.hand.radius[a] - self.hand.radius[b]
+        return row, torch.stack((a, b)), *near, gap
+
+    def limits(self, joints: Float[Tensor, "c a"]) -> tuple[Float[Tensor, " c"], Float[Tensor, "c a"]]:
+        """Sum of the angles (rad) beyond the limits of all joints, coupled ones included, and its gradient."""
+        angle = self.hand.all_joints(joints)
+        above, below = angle - self.hand.joint_upper, self.hand.joint_lower - angle
+        value = above.clamp_min(0).sum(1) + below.clamp_min(0).sum(1)
+        return value, ((above > 0).to(angle) - (below > 0).to(angle)) @ self.hand.joint_gain
+
+
+def net_wrench(
+    psi: Float[Tensor, "c k 3"], normals: Float[Tensor, "c k 3"]
+) -> tuple[Float[Tensor, "c 3"], Float[Tensor, "c 3"]]:
+    """G c of the paper: (sum of c_k, sum of [psi_k]x c_k)."""
+    return normals.sum(1), torch.linalg.cross(psi, normals).sum(1)
+
+
+def assemble(count: int, bodies: int, pushes: list[Push]) -> Float[Tensor, "c b 6"]:
+    """Sum of forces, and of their moments about the object's origin, on every body of every candidate."""
+    row, body, point, force = (torch.cat(parts) for parts in zip(*pushes, strict=True))
+    wrench = force.new_zeros(count * bodies, 6)
+    wrench.index_add_(0, row * bodies + body, torch.cat((force, torch.linalg.cross(point, force)), 1))
+    return wrench.view(count, bodies, 6)
+
+
+def segment_points(
+    a0: Float[Tensor, "n 3"], a1: Float[Tensor, "n 3"], b0: Float[Tensor, "n 3"], b1: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Nearest points of segments a0 a1 and b0 b1, which may have no length."""
+    u, v, w = a1 - a0, b1 - b0, a0 - b0
+    uu, vv, uv = (u * u).sum(-1), (v * v).sum(-1), (u * v).sum(-1)
+    uw, vw = (u * w).sum(-1), (v * w).sum(-1)
+    tiny = torch.finfo(a0.dtype).tiny
+    s = ((uv * vw - uw * vv) / (uu * vv - uv * uv).clamp_min(_SMALL**2)).clamp(0, 1)
+    t = ((uv * s + vw) / vv.clamp_min(tiny)).clamp(0, 1)
+    s = ((uv * t - uw) / uu.clamp_min(tiny)).clamp(0, 1)
+    return a0 + s.unsqueeze(-1) * u, b0 + t.unsqueeze(-1) * v

@@ -1,0 +1,110 @@
+"""Initial hand poses: the open palm before a point of the surface, the fingers across the part to be held."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float
+from torch import Tensor
+
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.objects.affordance_object import AffordanceObject
+
+SAMPLES = 2048
+"""Surface points to start from."""
+NEIGHBOURHOOD = 0.03
+"""Radius (m) in which the long axis of a part is estimated."""
+ELONGATED = 1.5
+"""A neighbourhood whose extents along its two longest axes differ less than this ratio has no long axis."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Random spread of initial poses.
+
+    Attributes:
+        gap: range of the distance between palm and surface point (m).
+        tilt: deviation of the palm's normal from the surface's (rad, one sigma per component).
+        roll: deviation of the hand's across axis from the part's long axis (rad, one sigma).
+        abduction: deviation (rad) of joints whose range contains zero in its middle half.
+        flexion: mean and deviation of all other joints, as a share of their range.
+    """
+
+    gap: tuple[float, float] = (-0.005, 0.025)
+    tilt: float = 0.35
+    roll: float = 0.2
+    abduction: float = 0.08
+    flexion: tuple[float, float] = (0.25, 0.1)
+
+
+class InitialPoses:
+    """Draws initial poses before one region of an object, or all around it.
+
+    Args:
+        obj: the object.
+        hand: the hand.
+        region: label to be held; None starts anywhere on the convex hull.
+        spread: of the poses.
+    """
+
+    def __init__(self, obj: AffordanceObject, hand: HandModel, region: str | None, spread: Spread) -> None:
+        surface = obj.solid.convex_hull if region is None else obj.region(region)
+        points, faces = trimesh.sample.sample_surface_even(surface, SAMPLES, seed=0)[:2]
+        self.hand, self.spread = hand, spread
+        self.points = torch.as_tensor(np.asarray(points), dtype=hand.dtype, device=hand.device)
+        normals = np.asarray(surface.face_normals[faces])
+        self.normals = torch.as_tensor(normals, dtype=hand.dtype, device=hand.device)
+        self.axes, self.elongated = long_axes(self.points)
+        self.frame = self.points.new_tensor(np.stack((hand.grip.normal, hand.grip.across, hand.grip.along)).copy())
+        self.center = self.points.new_tensor(hand.grip.center)
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c a"]]:
+        """Wrist poses in the object frame and actuated joints (rad)."""
+        spread, new = self.spread, self.points
+
+        def normal(*shape: int) -> Tensor:
+            return torch.randn(*shape, generator=generator).to(new)
+
+        chosen = torch.randint(len(self.points), (count,), generator=generator).to(new.device)
+        outward = unit(self.normals[chosen] + spread.tilt * normal(count, 3))
+        sign = normal(count, 1).sign()
+        random = normal(count, 3)
+        along_part = sign * self.axes[chosen] + spread.roll * normal(count, 3)
+        across = torch.where(self.elongated[chosen].unsqueeze(1), along_part, random)
+        across = unit(across - (across * outward).sum(-1, keepdim=True) * outward)
+        facing = torch.stack((-outward, across, torch.linalg.cross(-outward, across)), -1)
+        turn = facing @ self.frame
+        low, high = spread.gap
+        gap = low + (high - low) * torch.rand(count, 1, generator=generator).to(new)
+        wrist = torch.eye(4, dtype=new.dtype, device=new.device).repeat(count, 1, 1)
+        wrist[:, :3, :3] = turn
+        wrist[:, :3, 3] = self.points[chosen] + gap * outward - turn @ self.center
+        return wrist, self._joints(count, generator)
+
+    def _joints(self, count: int, generator: torch.Generator) -> Tensor:
+        hand, spread = self.hand, self.spread
+        noise = torch.randn(count, len(hand.lower), generator=generator).to(hand.lower)
+        extent = hand.upper - hand.lower
+        mean, deviation = spread.flexion
+        flexed = hand.lower + extent * (mean + deviation * noise)
+        zero_share = -hand.lower / extent
+        spreads = (zero_share > 0.25) & (zero_share < 0.75)
+        return torch.clamp(torch.where(spreads, spread.abduction * noise, flexed), hand.lower, hand.upper)
+
+
+def unit(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Vectors scaled to length 1."""
+    return torch.nn.functional.normalize(vectors, dim=-1)
+
+
+def long_axes(points: Float[Tensor, "p 3"]) -> tuple[Float[Tensor, "p 3"], Tensor]:
+    """Longest principal axis (p, 3) of each point's neighbourhood, and whether it is elongated (p,)."""
+    near = (torch.cdist(points, points) < NEIGHBOURHOOD).to(points)
+    mass = near.sum(1, keepdim=True)
+    mean = near @ points / mass
+    second = (near @ (points.unsqueeze(-1) * points.unsqueeze(-2)).flatten(1)).view(-1, 3, 3) / mass.unsqueeze(-1)
+    values, vectors = torch.linalg.eigh(second - mean.unsqueeze(-1) * mean.unsqueeze(-2))
+    return vectors[..., 2], values[:, 2] > ELONGATED**2 * values[:, 1]

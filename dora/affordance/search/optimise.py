@@ -1,0 +1,225 @@
+"""From an object to grasp candidates: the search, then what is measured and told about every candidate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dora.affordance.candidates import GraspCandidates, hand_digest
+from dora.affordance.hand.protocol import STANDARD, pregrasp, squeeze
+from dora.affordance.maps.contact_semantic_map import hand_contacts, pressed_contacts
+from dora.affordance.maps.voting import NO_CONTACT, vote
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.search.cache import field_of, hand_of, initial_of, map_of
+from dora.affordance.search.compiled import CompiledEnergy
+from dora.affordance.search.descent import Rows
+from dora.affordance.search.energies import GraspEnergy, Table
+from dora.affordance.search.penetration import Penetration, self_penetration
+from dora.affordance.search.quasi_static_closing import Steps, hold
+from dora.affordance.search.search import Search, Settings
+from dora.errors import InputError
+from dora.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
+from dora.robot import RobotDescription
+
+__all__ = ["Settings", "optimise"]
+
+Progress = Callable[[int, int], None]
+"""Called with the candidate-iterations done and their total."""
+OFF_TABLE = ("hammer", "microwave")
+"""Objects that their tasks do not take from a table: one is caught in the air, the other is a door's handle."""
+OPENINGS = (0.25, 0.5, 0.75, 1.0)
+"""Shares of the protocol's opening that are tried."""
+OPENING_DEPTH = 1e-3
+"""Overlap (m) with the object up to which a finger counts as clear of it."""
+SHALLOW = 9e-4
+"""Penetration (m) above which a candidate comes after those with less."""
+SEATING = Steps(closing=60, settling=20, weight=0)
+"""Steps of the hand that closes around the object."""
+NO_CLASS = "NoContact"
+"""Grasp class of a candidate without contact."""
+
+
+def optimise(
+    obj: AffordanceObject,
+    robot: RobotDescription,
+    num: int,
+    seed: int,
+    region: str | None = None,
+    settings: Settings | None = None,
+    device: torch.device | str = "cpu",
+    progress: Progress | None = None,
+) -> GraspCandidates:
+    """Search for grasps of an object.
+
+    Args:
+        obj: object.
+        robot: whose hand it is.
+        num: candidates wanted.
+        seed: of all random draws; equal seeds give equal candidates.
+        region: label to be held; None leaves it open.
+        settings: of the search.
+        device: torch device of the search and of the result.
+        progress: called with candidate-iterations done and their total.
+
+    Returns:
+        `num` candidates in the object frame, best first. `valid` tells which stay below the protocol's limit
+        of penetration at the candidate; whether a grasp holds is for a simulation to say.
+
+    Raises:
+        InputError: `num` is less than 1, the object has no such region, or it is too large for a hand.
+    """
+    settings = settings or Settings()
+    if num < 1:
+        raise InputError(f"the search makes at least 1 candidate, not {num}.")
+    place = str(torch.device(device))
+    hand, field = hand_of(robot, place), field_of(obj, region, place)
+    on_table = obj.name not in OFF_TABLE if settings.table is None else settings.table
+    kind = CompiledEnergy if hand.device.type == "cpu" else GraspEnergy
+    energy = kind(hand, field, settings.weights, table_of(obj) if on_table else None)
+    search = Search(energy, initial_of(obj, robot, region, settings.spread, place), settings)
+    wanted = math.ceil(num * settings.oversampling)
+    sizes = [min(settings.batch, wanted - start) for start in range(0, wanted, settings.batch)]
+    done, total = 0, wanted * settings.iterations
+
+    def report(rows: int) -> None:
+        nonlocal done
+        done += rows
+        if progress is not None:
+            progress(done, total)
+
+    def batch(size: int, index: int) -> Rows:
+        rows = search.run(size, torch.Generator().manual_seed(batch_seed(seed, index)), report)
+        if settings.seat and isinstance(energy, CompiledEnergy):
+            rows = search.polish(seated(energy, rows, obj.mass, settings.seat), settings.polish)
+        return rows
+
+    found = [batch(size, index) for index, size in enumerate(sizes)]
+    return _candidates(obj, energy, Rows.join(found), num, settings)
+
+
+def batch_seed(seed: int, index: int) -> int:
+    """Seed of one batch of a search."""
+    return int(np.random.SeedSequence([seed, index]).generate_state(1)[0])
+
+
+def table_of(obj: AffordanceObject) -> Table:
+    """The table under an object at rest, in the object frame."""
+    up = matrix_from_quaternion(torch.tensor(obj.rest, dtype=torch.float64))[2].tolist()
+    return Table((up[0], up[1], up[2]), obj.support)
+
+
+def _candidates(
+    obj: AffordanceObject, energy: GraspEnergy, rows: Rows, num: int, settings: Settings
+) -> GraspCandidates:
+    """The `num` best rows, measured and classified."""
+    hand, robot = energy.hand, energy.hand.robot
+    found = energy(rows.wrist, rows.joints, rows.contacts, settings.ramp)
+    poses = hand.forward(rows.wrist, rows.joints)
+    depth, self_depth = Penetration(hand, energy.field)(poses), self_penetration(energy, poses)
+    faults = 4 * (depth > STANDARD.penetration).long() + 2 * (self_depth > STANDARD.strict_self_penetration).long()
+    faults += (depth > SHALLOW).long()
+    judged = faults.argsort(stable=True)[: _judged(faults, num)]
+    quality, predicted, closed = _quality(obj, energy, rows, found.total, judged, num)
+    order = quality.argsort(descending=True)
+    best = order[faults[order].argsort(stable=True)][:num]
+    poses, joints, wrist = poses[best], rows.joints[best], rows.wrist[best]
+    if closed is None:
+        points, finger = hand_contacts(hand, energy.field, poses)
+    else:
+        points, finger = pressed_contacts(hand, energy.field, closed[best])
+    held = vote(map_of(obj, str(points.device)), points, finger)
+    full = robot.expand_hand(joints)
+    normal = full.new_tensor(hand.grip.normal)
+    return GraspCandidates(
+        object=obj.name,
+        position=wrist[:, :3, 3].contiguous(),
+        quaternion=quaternion_from_matrix(wrist[:, :3, :3]),
+        approach=wrist[:, :3, :3] @ normal,
+        pregrasp=opened(energy, wrist, full),
+        grasp=squeeze(robot, full),
+        grasp_class=tuple(NO_CLASS if label == NO_CONTACT else obj.classes[label] for label in held.tolist()),
+        joints=full,
+        contacts=points,
+        contact_finger=finger,
+        energy={name: value[best] for name, value in (found.terms | predicted).items()},
+        penetration=depth[best],
+        self_penetration=self_depth[best],
+        valid=depth[best] <= STANDARD.penetration,
+        digest=obj.digest,
+        robot=robot.name,
+        robot_digest=hand_digest(robot),
+        settings=repr(settings),
+    )
+
+
+def _judged(faults: Tensor, num: int) -> int:
+    """How many rows are worth judging: all without fault, but at least as many as are wanted."""
+    return max(num, int((faults == 0).sum()))
+
+
+def _quality(
+    obj: AffordanceObject, energy: GraspEnergy, rows: Rows, total: Tensor, judged: Tensor, num: int
+) -> tuple[Tensor, dict[str, Tensor], Tensor | None]:
+    """What candidates are ranked by (c,), more is better, the predictions it is made of, and poses (c, b, 4, 4) of the
+    closed hand, for the rows judged; of which the `num` best are wanted."""
+    if not isinstance(energy, CompiledEnergy):
+        return -total, {}, None
+    robot = energy.hand.robot
+    full = robot.expand_hand(rows.joints[judged])
+    held = hold(energy, rows.wrist[judged], pregrasp(robot, full), squeeze(robot, full), obj.mass, wanted=num)
+
+    def spread(values: Tensor, missing: float) -> Tensor:
+        return torch.full_like(total, missing).index_copy_(0, judged, values)
+
+    predictions = {
+        "predicted_shift": spread(held.shift, math.nan),
+        "predicted_displacement": spread(held.displacement[:, -1], math.nan),
+        "predicted_force": spread(held.force, math.nan),
+    }
+    closed = energy.hand.forward(held.wrist, robot.reduce_hand(held.joints))
+    poses = closed.new_full((len(total), *closed.shape[1:]), math.nan).index_copy_(0, judged, closed)
+    return spread(held.quality, -math.inf), predictions, poses
+
+
+def seated(energy: CompiledEnergy, rows: Rows, mass: float, squeezed: float) -> Rows:
+    """Rows after their hands have closed around the object; what a squeeze then adds is force.
+
+    Args:
+        energy: knows hand, object and table.
+        rows: with the fingers about where they should touch.
+        mass: of the object (kg).
+        squeezed: how far the command goes beyond the posture (rad).
+    """
+    robot = energy.hand.robot
+    full = robot.expand_hand(rows.joints)
+    closed = squeeze(robot, full, replace(STANDARD, squeeze=squeezed))
+    held = hold(energy, rows.wrist, pregrasp(robot, full), closed, mass, steps=SEATING, on_table=True)
+    return replace(rows, wrist=held.wrist.contiguous(), joints=robot.reduce_hand(held.joints))
+
+
+def opened(energy: GraspEnergy, wrist: Float[Tensor, "c 4 4"], joints: Float[Tensor, "c j"]) -> Float[Tensor, "c j"]:
+    """The protocol's open hand, every finger opened only as far as it stays clear of the object behind it.
+
+    Args:
+        energy: knows hand and object.
+        wrist: pose of the wrist in the object frame.
+        joints: all hand joints in contact (rad), in the order of `RobotDescription.hand`.
+    """
+    hand = energy.hand
+    wide = pregrasp(hand.robot, joints)
+    fingers = list(hand.robot.fingers.values())
+    owner = [next(i for i, finger in enumerate(fingers) if name in finger.joints) for name in hand.robot.hand.names]
+    share = joints.new_zeros(len(joints), hand.fingers)
+    for trial in OPENINGS:
+        poses = hand.forward(wrist, hand.robot.reduce_hand(torch.lerp(joints, wide, trial)))
+        depth = hand.sphere_radius - energy.field.distance(hand.place(poses, hand.spheres))
+        part = hand.part[hand.spheres.body] - 2
+        deepest = torch.stack([depth[:, part == index].amax(1) for index in range(hand.fingers)], 1)
+        share = torch.where((deepest < OPENING_DEPTH) & (share == trial - OPENINGS[0]), trial, share)
+    return torch.lerp(joints, wide, share[:, owner])

@@ -1,0 +1,202 @@
+"""Gradient descent on the grasp energy from many initial poses at once.
+
+Every row is one candidate. Adam moves wrist and joints; now and then half of the contact points of a row
+are drawn anew and kept if its energy is lower. A row starts as the best of several draws; after a part of the
+iterations only the better rows stay; the weights of terms that must vanish grow in the last part; rows that
+have converged leave the batch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from dora.affordance.search.compiled import CompiledDescent, CompiledEnergy
+from dora.affordance.search.descent import Descent, Rows, Schedule
+from dora.affordance.search.energies import GraspEnergy, Weights
+from dora.affordance.search.initial_poses import InitialPoses, Spread
+from dora.errors import InputError
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the search.
+
+    Attributes:
+        iterations: gradient steps per candidate.
+        contacts: contact points per candidate: one on the palm, one on the thumb (the first finger), the others on
+            the other fingers in random order, and on any finger beyond that.
+        weights: of the energy terms.
+        ramp: factor on the weights of penetration, table and self-penetration at the end.
+        ramp_start: share of the iterations after which the ramp begins.
+        resample: iterations between attempts to draw contact points anew.
+        resample_until: share of the iterations after which contact points stay.
+        starts: initial poses drawn per candidate; the best is taken.
+        field_size: rows started per candidate; at the share `halving` of the iterations only the best stay.
+        halving: see `field_size`.
+        settle: share of the iterations after which rows that have converged stop.
+        oversampling: candidates finished per candidate asked for; the best are returned.
+        seat: how far the hand then closes around the object (rad), for contacts that are not made yet; 0: not at all.
+        polish: gradient steps that remove overlaps after that.
+        translation: largest step of the wrist (m).
+        rotation: largest rotation of the wrist in a step (rad).
+        joint: largest step of a joint (rad).
+        batch: candidates searched at once; more does not fit a core's cache.
+        table: keep the hand above the table on which the object rests; None: unless it is one of `OFF_TABLE`.
+        spread: of the initial poses.
+    """
+
+    iterations: int = 40
+    contacts: int = 9
+    weights: Weights = field(default_factory=Weights)
+    ramp: float = 12.0
+    ramp_start: float = 0.4
+    resample: int = 8
+    resample_until: float = 0.6
+    starts: int = 8
+    field_size: float = 2.0
+    halving: float = 0.5
+    settle: float = 0.6
+    oversampling: float = 2.5
+    seat: float = 0.7
+    polish: int = 80
+    polish_weights: Weights = field(default_factory=lambda: Weights(closure=0.0, closing=300.0))
+    translation: float = 2e-3
+    rotation: float = 0.02
+    joint: float = 0.02
+    batch: int = 128
+    table: bool | None = None
+    spread: Spread = field(default_factory=Spread)
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "contacts", "resample", "starts", "batch"):
+            if getattr(self, name) < 1:
+                raise InputError(f"the search needs {name} of at least 1, not {getattr(self, name)}.")
+
+
+CHECK = 5
+"""Iterations between checks for rows that have settled."""
+SETTLED = 2e-3
+"""Relative change of the energy between two checks below which a row has settled."""
+TOLERANCE = 1e-4
+"""Sum of overlaps (m) that a settled row may have, skin included."""
+POLISH_STEP = 0.5
+"""Largest steps of polishing, in those of the search."""
+LAST_STEP = 0.01
+"""Share of the step sizes that is left at the end of the cosine schedule."""
+
+
+class Search:
+    """Gradient search of one object with one hand."""
+
+    def __init__(self, energy: GraspEnergy, initial: InitialPoses, settings: Settings) -> None:
+        self.energy, self.initial, self.settings = energy, initial, settings
+        hand = energy.hand
+        steps = [settings.translation] * 3 + [settings.rotation] * 3 + [settings.joint] * len(hand.lower)
+        kind = CompiledDescent if isinstance(energy, CompiledEnergy) else Descent
+        self.descent = kind(energy, hand.lower.new_tensor(steps))
+        self.polishing = kind(energy.weighted(settings.polish_weights), hand.lower.new_tensor(steps))
+        parts = hand.contact_part.unique().tolist()
+        self._points = [(hand.contact_part == part).nonzero().squeeze(1) for part in parts]
+
+    def run(self, count: int, generator: torch.Generator, progress: Callable[[int], None]) -> Rows:
+        """Search and return `count` candidates; `progress` gets the number of rows times the steps they took."""
+        settings, hand = self.settings, self.energy.hand
+        rows = self.start(math.ceil(count * settings.field_size), generator)
+        last = settings.iterations
+        halving = max(1, int(settings.halving * last))
+        resampling = range(settings.resample, math.ceil(settings.resample_until * last), settings.resample)
+        checks = range(CHECK * (1 + int(settings.settle * last) // CHECK), last, CHECK)
+        finished = []
+        for start, stop in pairwise(sorted({0, last, halving, *resampling, *checks})):
+            if start in resampling:
+                self._resample(rows, self._ramp(start), generator)
+            before = rows.total
+            steps = range(start, stop)
+            self.descent(rows, Schedule(start, [self._ramp(i) for i in steps], [fading(i / last) for i in steps]))
+            progress(len(rows) * len(steps))
+            if stop == halving:
+                rows = rows.select(rows.total.argsort()[:count])
+            elif stop in checks:
+                settled = ((before - rows.total).abs() < SETTLED * rows.total) & (rows.overlap < TOLERANCE)
+                finished.append(rows.select(settled))
+                rows = rows.select(~settled)
+                if not len(rows):
+                    break
+        rows = Rows.join([*finished, rows])
+        rows.joints = torch.clamp(rows.joints, hand.lower, hand.upper)
+        return rows
+
+    def _ramp(self, step: int) -> float:
+        """Factor on the weights of `RAMPED`."""
+        settings = self.settings
+        return 1 + (settings.ramp - 1) * max(0.0, step / settings.iterations - settings.ramp_start) / (
+            1 - settings.ramp_start
+        )
+
+    def start(self, count: int, generator: torch.Generator) -> Rows:
+        """The best of `starts` initial poses of every candidate."""
+        starts = self.settings.starts
+        wrist, joints = self.initial.draw(count * starts, generator)
+        contacts = self.draw_contacts(count * starts, generator)
+        total = torch.cat(
+            [
+                self.energy(*part).total
+                for part in zip(*(x.split(self.settings.batch) for x in (wrist, joints, contacts)), strict=True)
+            ]
+        )
+        best = total.view(starts, count).argmin(0) * count + torch.arange(count, device=total.device)
+        return Rows.begin(wrist[best], joints[best], contacts[best], total[best])
+
+    def draw_contacts(self, count: int, generator: torch.Generator) -> Int[Tensor, "c k"]:
+        """Random contact points: palm, first finger, the other fingers in random order, then any finger."""
+        fingers, contacts = len(self._points) - 1, self.settings.contacts
+        others = torch.rand(count, fingers - 1, generator=generator).argsort(1) + 2
+        extra = torch.randint(1, fingers + 1, (count, contacts), generator=generator)
+        part = torch.cat((torch.tensor([[0, 1]]).expand(count, -1), others, extra), 1)[:, :contacts]
+        share = torch.rand(count, contacts, generator=generator)
+        sizes = torch.tensor([len(points) for points in self._points])
+        starts = sizes.cumsum(0) - sizes
+        every = torch.cat(self._points)
+        return every[(starts[part] + (share * sizes[part]).long()).to(every.device)]
+
+    def _resample(self, rows: Rows, ramp: float, generator: torch.Generator) -> None:
+        """Draw half of the contact points anew; keep them where the energy is lower."""
+        fresh = self.draw_contacts(len(rows), generator)
+        stay = (torch.rand(fresh.shape, generator=generator) < 0.5).to(fresh.device)
+        fresh = torch.where(stay, rows.contacts, fresh)
+        now, then = (self.energy(rows.wrist, rows.joints, points, ramp).total for points in (rows.contacts, fresh))
+        rows.contacts = torch.where((then < now).unsqueeze(1), fresh, rows.contacts)
+
+    def polish(self, rows: Rows, iterations: int) -> Rows:
+        """Descend from where rows are: full weights on overlaps, the nearest points as contacts."""
+        settings, hand = self.settings, self.energy.hand
+        rows = Rows.begin(rows.wrist, rows.joints, self.nearest_contacts(rows), rows.total)
+        sizes = [POLISH_STEP * fading(step / iterations) for step in range(iterations)]
+        self.polishing(rows, Schedule(0, [settings.ramp] * iterations, sizes))
+        rows.joints = torch.clamp(rows.joints, hand.lower, hand.upper)
+        return rows
+
+    def nearest_contacts(self, rows: Rows) -> Int[Tensor, "c k"]:
+        """The nearest point of the palm, and of the nearest of the other links."""
+        hand = self.energy.hand
+        points = hand.place(hand.forward(rows.wrist, rows.joints), hand.contacts)
+        distance = self.energy.field.distance(points).abs()
+        counts = torch.unique_consecutive(hand.contacts.body, return_counts=True)[1]
+        starts = counts.cumsum(0) - counts
+        found = [part.min(1) for part in distance.split(counts.tolist(), 1)]
+        index = torch.stack([part.indices for part in found], 1) + starts
+        gap = torch.stack([part.values for part in found], 1)
+        gap[:, 0] = -1.0
+        return torch.take_along_dim(index, gap.argsort(1)[:, : self.settings.contacts], 1)
+
+
+def fading(done: float) -> float:
+    """Cosine schedule of step sizes: from 1 at `done` = 0 to `LAST_STEP` at 1."""
+    return LAST_STEP + (1 - LAST_STEP) * 0.5 * (1 + math.cos(math.pi * done))

@@ -1,0 +1,1 @@
+"""Pictures and the web page of objects, maps and grasps; nothing here computes a grasp."""

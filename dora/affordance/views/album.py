@@ -1,0 +1,77 @@
+"""The pictures that show an object and its grasps, as files: regions, some grasps, their contact semantic maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.objects.catalogue import available_objects, load_object
+from dora.affordance.search.cache import map_of
+from dora.affordance.views.page import Surface
+from dora.affordance.views.pictures import caption, picture_contacts, picture_grasps, picture_objects
+from dora.errors import InputError
+from dora.robot import RobotDescription
+
+SHOWN = 4
+"""Grasps in a picture."""
+EDGE = 0.002
+"""Longest edge of the triangles of a contact semantic map [m]."""
+OBJECTS = "objects.png"
+"""Name of the picture of all objects."""
+
+
+def write_album(
+    obj: AffordanceObject, candidates: GraspCandidates | None, robot: RobotDescription, folder: Path
+) -> list[Path]:
+    """Write OBJECT-map.png and, with candidates, OBJECT-grasps.png and OBJECT-contacts.png; returns their paths.
+
+    Args:
+        obj: the object.
+        candidates: of this object, best first; `chosen` ones are shown.
+        robot: whose hand grasps.
+        folder: for the files.
+
+    Raises:
+        InputError: the folder or a file cannot be written.
+    """
+    _make(folder)
+    paths = [folder / f"{obj.name}-{what}.png" for what in ("map", "grasps", "contacts")]
+    map_of(obj, "cpu").picture(paths[0])
+    if candidates is None:
+        return paths[:1]
+    shown = candidates.select(chosen(candidates))
+    picture_grasps(shown, obj, robot, paths[1])
+    surface, hand = Surface(obj, EDGE), HandModel(robot)
+    maps = [surface.parts(shown, row, hand) for row in range(len(shown))]
+    titles = [caption(shown, row) for row in range(len(shown))]
+    picture_contacts(surface.mesh, maps, titles, obj.name, paths[2])
+    return paths
+
+
+def write_objects(folder: Path) -> Path:
+    """Write a picture of all of Dora's objects into a folder; returns its path.
+
+    Raises:
+        InputError: the folder or the file cannot be written.
+    """
+    _make(folder)
+    picture_objects([load_object(name) for name in available_objects()], folder / OBJECTS)
+    return folder / OBJECTS
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"Cannot make the folder {folder} ({error.strerror}): choose another one.") from error
+
+
+def chosen(candidates: GraspCandidates) -> list[int]:
+    """Rows of at most `SHOWN` grasps: the first valid one of every class, then the first of all others."""
+    valid = candidates.valid.nonzero()[:, 0].tolist() or list(range(len(candidates)))
+    names = candidates.grasp_class
+    first = [row for i, row in enumerate(valid) if names[row] not in {names[other] for other in valid[:i]}]
+    rest = [row for row in valid if row not in first]
+    return sorted((first + rest)[:SHOWN])

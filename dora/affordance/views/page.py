@@ -1,0 +1,318 @@
+"""A web page with an object, its regions, and the hand at each of its grasps."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.hand.hand_mesh import GAMMA, HandMesh, face_colours
+from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.maps.contact_semantic_map import contact_semantic_map
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.views.palette import PALETTE, colours
+from dora.affordance.views.pictures import PARTS
+from dora.errors import InputError
+from dora.geometry.rotations import quaternion_from_matrix
+from dora.robot import RobotDescription
+
+MOST_HANDS = 16
+"""Hands that a page can show at once."""
+EDGE = 0.004
+"""Longest edge of the triangles that carry colours [m]."""
+MOST_CUTS = 12
+"""Times that a triangle is cut at most."""
+CONTACT_SIZE = 0.004
+"""Size of a contact point [m]."""
+VIEWPOINT = 1.0
+"""Distance of the first view along x and y, in diagonals of the object."""
+AMBIENT = 1.5
+"""Intensity of the light from everywhere; viser's own lights leave dark links black."""
+REGIONS, CONTACTS = "affordance regions", "contacts of the grasp"
+"""What the surface's colours can mean."""
+ANY_VALIDITY, VALID, INVALID = "all", "valid", "not valid"
+"""Choices of the filter by validity."""
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Which candidates are shown.
+
+    Attributes:
+        classes: grasp classes.
+        validity: "all", "valid" or "not valid".
+        term: energy term to filter by; None for no such filter.
+        share: of the candidates of all classes, those with the lowest value of `term`, 0 to 1.
+    """
+
+    classes: frozenset[str]
+    validity: str = ANY_VALIDITY
+    term: str | None = None
+    share: float = 1.0
+
+    def rows(self, candidates: GraspCandidates) -> Int[Tensor, " m"]:
+        """Indices of the candidates that pass, in their order."""
+        mask: Bool[Tensor, " c"] = candidates.of_class(*self.classes)
+        if self.validity != ANY_VALIDITY:
+            mask = mask & (candidates.valid == (self.validity == VALID))
+        if self.term is not None:
+            value = candidates.energy[self.term]
+            mask = mask & (value <= torch.quantile(value, self.share))
+        return mask.nonzero().squeeze(1)
+
+
+def describe(candidates: GraspCandidates, row: int) -> str:
+    """Markdown about one candidate: class, verdict, overlaps, contacts and energies."""
+    names = list(PARTS)
+    touching = sorted({int(f) for f in candidates.contact_finger[row] if f > 0})
+    score = float(candidates.score[row])
+    lines = [
+        f"**{candidates.grasp_class[row]}** (candidate {row})",
+        f"- {'valid' if candidates.valid[row] else 'not valid'}",
+        f"- succeeded in {100 * score:.0f} % of its executions" if np.isfinite(score) else "- not ranked",
+        f"- {1000 * float(candidates.penetration[row]):.2f} mm into the object",
+        f"- {1000 * float(candidates.self_penetration[row]):.2f} mm into itself",
+        f"- contacts: {', '.join(names[f] for f in touching) or 'none'}",
+        *(f"- {name}: {float(value[row]):.3g}" for name, value in candidates.energy.items()),
+    ]
+    return "\n".join(lines)
+
+
+class Surface:
+    """The object's mesh, cut into triangles with edges of at most `edge` [m], which carry colours."""
+
+    def __init__(self, obj: AffordanceObject, edge: float = EDGE) -> None:
+        vertices, faces, *origin = trimesh.remesh.subdivide_to_size(
+            obj.mesh.vertices, obj.mesh.faces, edge, MOST_CUTS, return_index=True
+        )
+        self.mesh = trimesh.Trimesh(vertices, faces, process=False)
+        self.labels = obj.face_labels[origin[0]]
+        self.centres = torch.tensor(self.mesh.triangles_center, dtype=torch.float32)
+
+    def regions(self) -> UInt8[np.ndarray, "f 4"]:
+        """Face colours of the affordance map."""
+        return colours(self.labels, PALETTE)
+
+    def contacts(self, candidates: GraspCandidates, row: int, hand: HandModel) -> UInt8[np.ndarray, "f 4"]:
+        """Face colours of the contact semantic map of one candidate."""
+        return colours(self.parts(candidates, row, hand), tuple(PARTS.values()))
+
+    def parts(self, candidates: GraspCandidates, row: int, hand: HandModel) -> Int[np.ndarray, " f"]:
+        """The contact semantic map of one candidate: what touches each face, an index into `PARTS`."""
+        one = candidates.select([row])
+        part = contact_semantic_map(self.centres, one.position, one.quaternion, one.joints, hand)
+        return part[0].numpy()
+
+    def painted(self, face_colours: UInt8[np.ndarray, "f 4"]) -> trimesh.Trimesh:
+        """The mesh in these colours, faces not sharing vertices."""
+        return unshared(self.mesh, face_colours)
+
+
+def unshared(mesh: trimesh.Trimesh, face_colours: np.ndarray) -> trimesh.Trimesh:
+    """A mesh of which every face has its own vertices, so that colours keep their edges in glTF, stored linear."""
+    linear = (255 * (face_colours[:, :3] / 255) ** GAMMA).round()
+    corners = mesh.triangles.reshape(-1, 3)
+    normals = mesh.vertex_normals[mesh.faces].reshape(-1, 3)
+    return trimesh.Trimesh(
+        corners,
+        np.arange(len(corners)).reshape(-1, 3),
+        vertex_normals=normals,
+        vertex_colors=np.repeat(linear.astype(np.uint8), 3, axis=0),
+        process=False,
+    )
+
+
+class Hands:
+    """Up to `MOST_HANDS` posed hands; links of equal shape are one batch."""
+
+    def __init__(self, scene: Any, robot: RobotDescription) -> None:
+        self.mesh = HandMesh(robot)
+        groups: dict[bytes, list[str]] = {}
+        for name, link in self.mesh.links.items():
+            groups.setdefault(link.vertices.tobytes() + face_colours(link).tobytes(), []).append(name)
+        self._batches = []
+        for names in groups.values():
+            link = self.mesh.links[names[0]]
+            count = MOST_HANDS * len(names)
+            handle = scene.add_batched_meshes_trimesh(
+                f"/hands/{names[0]}",
+                unshared(link, face_colours(link)),
+                batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+                batched_positions=np.zeros((count, 3)),
+                batched_scales=np.zeros(count),
+                lod="off",
+            )
+            self._batches.append((names, handle))
+
+    def show(self, candidates: GraspCandidates | None) -> None:
+        """Pose the hands at these candidates, `MOST_HANDS` at most; None shows no hand."""
+        count = 0 if candidates is None else len(candidates)
+        poses = (
+            {}
+            if candidates is None
+            else self.mesh.world_poses(candidates.position, candidates.quaternion, candidates.joints)
+        )
+        for names, handle in self._batches:
+            scales = np.zeros((len(names), MOST_HANDS))
+            scales[:, :count] = 1.0
+            if poses:
+                handle.batched_positions = _filled([poses[name][:, :3, 3] for name in names], (0.0, 0.0, 0.0))
+                turns = [quaternion_from_matrix(poses[name][:, :3, :3]) for name in names]
+                handle.batched_wxyzs = _filled(turns, (1.0, 0.0, 0.0, 0.0))
+            handle.batched_scales = scales.ravel().astype(np.float32)
+
+
+def _filled(values: list[Float[Tensor, "c d"]], rest: tuple[float, ...]) -> Float[np.ndarray, "n d"]:
+    """Rows of every link, each filled up to `MOST_HANDS` with `rest`."""
+    table = np.tile(np.array(rest, dtype=np.float32), (len(values), MOST_HANDS, 1))
+    for link, value in enumerate(values):
+        table[link, : len(value)] = value.numpy()
+    return table.reshape(-1, len(rest))
+
+
+class GraspPage:
+    """A running page; callbacks of its widgets change the scene.
+
+    Args:
+        obj: object.
+        candidates: its grasps, or None to show the regions only.
+        robot: whose hand it is.
+        port: of the page; a port in use is refused.
+        host: address to listen on; the default is reached from this machine only.
+
+    Attributes:
+        server: viser's server; `server.stop()` ends the page.
+
+    Raises:
+        InputError: viser is not installed, or the port is in use.
+    """
+
+    def __init__(
+        self,
+        obj: AffordanceObject,
+        candidates: GraspCandidates | None,
+        robot: RobotDescription,
+        port: int = 8080,
+        host: str = "127.0.0.1",
+    ) -> None:
+        self.obj, self.candidates = obj, candidates
+        self.server = start_server(host, port, f"Dora: {obj.name}")
+        self.surface = Surface(obj)
+        self.model = HandModel(robot)
+        self.server.scene.set_up_direction("+z")
+        self.server.scene.add_light_ambient("/ambient", intensity=AMBIENT)
+        away = VIEWPOINT * float(np.linalg.norm(obj.mesh.extents))
+        self.server.initial_camera.position = (away, -away, 0.8 * away)
+        self.server.initial_camera.look_at = (0.0, 0.0, 0.0)
+        self._paint(self.surface.regions())
+        if candidates is not None:
+            self.hands = Hands(self.server.scene, robot)
+            self._add_widgets(candidates)
+            self.refresh()
+        self._add_legend()
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def _add_legend(self) -> None:
+        rows = [("Regions", dict(zip(self.obj.labels, PALETTE * len(self.obj.labels), strict=False)))]
+        if self.candidates is not None:
+            rows.append(("Contacts", PARTS))
+        with self.server.gui.add_folder("Colours"):
+            for title, table in rows:
+                boxes = " ".join(
+                    f'<span style="background: rgb{rgb}; border-radius: 3px; padding: 0 0.5em">{name}</span>'
+                    for name, rgb in table.items()
+                )
+                self.server.gui.add_html(f'<div style="padding: 0.3em 1em; line-height: 1.8">{title}: {boxes}</div>')
+
+    def _add_widgets(self, candidates: GraspCandidates) -> None:
+        gui = self.server.gui
+        self.colouring = gui.add_dropdown("surface", (REGIONS, CONTACTS))
+        with gui.add_folder("Filter"):
+            self.classes = {
+                name: gui.add_checkbox(f"{name} ({count})", True) for name, count in candidates.counts().items()
+            }
+            self.validity = gui.add_dropdown("validity", (ANY_VALIDITY, VALID, INVALID))
+            self.term = gui.add_dropdown("energy", ("-", *candidates.energy))
+            self.share = gui.add_slider("lowest %", 1, 100, 1, 100)
+        with gui.add_folder("Grasp"):
+            self.chosen = gui.add_slider("grasp", 1, max(2, len(candidates)), 1, 1)
+            self.count = gui.add_slider("hands", 0, MOST_HANDS, 1, 1)
+            self.text = gui.add_markdown("")
+        widgets = (
+            *self.classes.values(),
+            self.colouring,
+            self.validity,
+            self.term,
+            self.share,
+            self.chosen,
+            self.count,
+        )
+        for widget in widgets:
+            widget.on_update(lambda _: self.refresh())
+
+    @property
+    def filter(self) -> Filter:
+        """What the widgets say."""
+        return Filter(
+            frozenset(name for name, box in self.classes.items() if box.value),
+            self.validity.value,
+            None if self.term.value == "-" else self.term.value,
+            self.share.value / 100,
+        )
+
+    def refresh(self) -> None:
+        """Show what the widgets ask for: the chosen grasp among those that pass, and the ones after it."""
+        assert self.candidates is not None
+        rows = self.filter.rows(self.candidates).tolist()
+        first = min(self.chosen.value - 1, max(len(rows) - 1, 0))
+        shown = rows[first : first + self.count.value]
+        if not rows:
+            self.text.content = "No grasp passes the filter."
+        else:
+            self.text.content = f"grasp {first + 1} of {len(rows)}\n\n{describe(self.candidates, rows[first])}"
+        self.hands.show(self.candidates.select(shown) if shown else None)
+        if rows and self.colouring.value == CONTACTS:
+            self._paint(self.surface.contacts(self.candidates, rows[first], self.model))
+        else:
+            self._paint(self.surface.regions())
+        self._show_contacts(rows[first] if rows else None)
+
+    def _paint(self, face_colours: np.ndarray) -> None:
+        key = face_colours.tobytes()
+        if key != getattr(self, "_painted", None):
+            self._painted = key
+            self.server.scene.add_mesh_trimesh("/object", self.surface.painted(face_colours))
+
+    def _show_contacts(self, row: int | None) -> None:
+        assert self.candidates is not None
+        points, finger = np.zeros((0, 3)), np.zeros(0, dtype=int)
+        if row is not None:
+            touching = self.candidates.contact_finger[row] > 0
+            points = self.candidates.contacts[row][touching].numpy()
+            finger = self.candidates.contact_finger[row][touching].numpy()
+        shown = colours(finger, tuple(PARTS.values()))[:, :3]
+        self.server.scene.add_point_cloud("/contacts", points, shown, point_size=CONTACT_SIZE, point_shape="circle")
+
+
+def start_server(host: str, port: int, label: str) -> Any:
+    """viser's server on exactly this port; InputError if viser is missing or the port is in use."""
+    try:
+        viser = importlib.import_module("viser")
+    except ImportError as error:
+        raise InputError("The page needs viser, which is not installed: pip install 'dora[view]'.") from error
+    server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    if server.get_port() != port:
+        server.stop()
+        raise InputError(f"Port {port} is in use: choose another one with --port.")
+    return server

@@ -1,0 +1,152 @@
+"""PNG pictures of objects, grasps and contact semantic maps, on any machine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Int
+
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.hand.hand_mesh import HandMesh
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.views.palette import PALETTE, colours, legend_of
+from dora.affordance.views.rasteriser import Camera, render, seen
+from dora.affordance.views.sheet import Panel, write_sheet
+from dora.robot import RobotDescription
+
+PARTS = {
+    "no contact": (205, 205, 205),
+    "palm": (122, 92, 70),
+    "thumb": (225, 87, 89),
+    "index": (242, 142, 43),
+    "middle": (237, 201, 72),
+    "ring": (89, 161, 79),
+    "pinky": (78, 121, 167),
+}
+"""Classes of a contact semantic map and their colours."""
+TILE = 420
+"""Width and height of one view [pixels]."""
+OBJECT_VIEW = (-1.0, 0.35)
+"""Azimuth and elevation of the views of objects [rad]."""
+VIEW = (0.6, 0.5)
+"""Azimuth, where there is nothing to look at, and elevation of the views of contact maps [rad]."""
+AZIMUTHS, ELEVATIONS = 8, (0.15, 0.55)
+"""Number of azimuths and the elevations [rad] from which a grasp may be seen."""
+PREVIEW = 64
+"""Width and height of the views by which the best one is chosen [pixels]."""
+GRIPPED = 0.03
+"""Distance to a contact point up to which a surface counts as held [m]."""
+MILLIMETRES = 1000.0
+"""Per metre."""
+
+
+def coloured(obj: AffordanceObject) -> trimesh.Trimesh:
+    """The object's mesh, every face in the colour of its region."""
+    mesh = obj.mesh
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, face_colors=colours(obj.face_labels, PALETTE), process=False)
+
+
+def picture_objects(objects: Sequence[AffordanceObject], path: Path | str) -> None:
+    """Write a PNG of objects with the names and colours of their regions. Every object fills its view."""
+    panels = []
+    for obj in objects:
+        mesh = coloured(obj)
+        size = " x ".join(f"{MILLIMETRES * extent:.0f}" for extent in mesh.extents)
+        view = render([mesh], Camera.around([mesh], *OBJECT_VIEW), TILE, TILE)
+        panels.append(Panel(view, f"{obj.name}, {size} mm", legend_of(obj.labels)))
+    write_sheet(panels, path, len(panels))
+
+
+def picture_grasps(
+    candidates: GraspCandidates, obj: AffordanceObject, robot: RobotDescription, path: Path | str, columns: int = 4
+) -> None:
+    """Write a PNG with one view of every candidate: give a few, `columns` to a row.
+
+    The hand is in its posture at contact, seen from where it and what it holds are seen best.
+    """
+    mesh, panels = coloured(obj), []
+    vertices, faces, *_ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, GRIPPED)
+    cut = trimesh.Trimesh(vertices, faces, process=False)
+    model = HandMesh(robot)
+    for row, hand in enumerate(model.posed(candidates.position, candidates.quaternion, candidates.joints)):
+        camera = best_view(cut, hand, _held(candidates, row, cut.triangles_center), model.fingers)
+        view = render([mesh, hand], camera, TILE, TILE)
+        panels.append(Panel(view, caption(candidates, row)))
+    write_sheet(panels, path, min(columns, len(panels)), legend_of(obj.labels), obj.name)
+
+
+def picture_contacts(
+    mesh: trimesh.Trimesh,
+    faces: Sequence[Int[np.ndarray, " f"]],
+    titles: Sequence[str],
+    name: str,
+    path: Path | str,
+) -> None:
+    """Write a PNG of contact semantic maps, each seen from where most of its contacts are and from the other side.
+
+    Args:
+        mesh: the object's surface, fine enough to carry colours.
+        faces: per map the class of every face, 0..6.
+        titles: of the maps.
+        name: of the object.
+        path: of the file.
+    """
+    table = tuple(PARTS.values())
+    front, back = [], []
+    for classes, title in zip(faces, titles, strict=True):
+        painted = trimesh.Trimesh(mesh.vertices, mesh.faces, face_colors=colours(classes, table), process=False)
+        azimuth = _towards(mesh, classes > 0)
+        for panels, turn, words in ((front, 0.0, title), (back, np.pi, "the other side")):
+            camera = Camera.around([painted], azimuth + turn, VIEW[1])
+            panels.append(Panel(render([painted], camera, TILE, TILE), words))
+    write_sheet([*front, *back], path, len(front), PARTS, name)
+
+
+def _towards(mesh: trimesh.Trimesh, faces: np.ndarray) -> float:
+    """Azimuth [rad] of a view from the side to which most of the area of some faces looks."""
+    x, y, _ = (mesh.area_faces * faces) @ mesh.face_normals
+    return float(np.arctan2(y, x)) if np.hypot(x, y) > 0 else VIEW[0]
+
+
+def caption(candidates: GraspCandidates, row: int) -> str:
+    """Class, deepest overlap and, if ranked, the score of a candidate."""
+    words = [candidates.grasp_class[row]]
+    depth, score = float(candidates.penetration[row]), float(candidates.score[row])
+    if np.isfinite(depth):
+        words.append(f"{1000 * depth:.1f} mm deep")
+    if np.isfinite(score):
+        words.append(f"score {score:.2f}")
+    return ", ".join(words)
+
+
+def best_view(
+    mesh: trimesh.Trimesh, hand: trimesh.Trimesh, held: Bool[np.ndarray, " f"], fingers: Bool[np.ndarray, " h"]
+) -> Camera:
+    """The camera, of those around, that sees most of an object's held faces and most of the hand's fingers.
+
+    Args:
+        mesh: the object.
+        hand: in its posture.
+        held: which faces of the object count.
+        fingers: which faces of the hand count.
+    """
+    grip = np.concatenate([held, np.zeros(len(fingers) + 1, bool)])
+    grasping = np.concatenate([np.zeros(len(held), bool), fingers, [False]])
+
+    def worth(camera: Camera) -> int:
+        found = seen([mesh, hand], camera, PREVIEW, PREVIEW)
+        return int(grip[found].sum()) * int(grasping[found].sum())
+
+    azimuths = 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
+    return max((Camera.around([mesh, hand], float(a), e) for a in azimuths for e in ELEVATIONS), key=worth)
+
+
+def _held(candidates: GraspCandidates, row: int, centres: np.ndarray) -> Bool[np.ndarray, " f"]:
+    """Which faces, of given centres (f, 3) [m], are near a contact of a candidate; all if it has none."""
+    points = candidates.contacts[row][candidates.contact_finger[row] > 0].numpy()
+    if not len(points):
+        return np.ones(len(centres), bool)
+    return np.linalg.norm(centres[:, None] - points, axis=-1).min(1) < GRIPPED
