@@ -16,7 +16,7 @@ Progress = Callable[[int, int], None]
 
 CHUNK = 4
 """Cases that a process takes at once, where they are short."""
-PRELOADED = ["dora.sim.validation", "dora.sim.ranking"]
+PRELOADED = ["dora.sim.grasp_tests.shake_test", "dora.sim.grasp_tests.lift_test"]
 """Modules that are imported once for all processes, where the system can fork them from a clean server."""
 
 

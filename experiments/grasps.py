@@ -20,9 +20,9 @@ from dora.affordance.objects.importing import import_object
 from dora.errors import InputError
 from dora.progress import PhaseProgress
 from dora.robot import load_robot
-from dora.sim.grasp_report import check_out, print_report, write_report
-from dora.sim.grasps import baselines, by_region, generate, summary, voting_summary
-from dora.sim.shipping import ship
+from dora.sim.grasp_tests.bundle_maker import ship
+from dora.sim.grasp_tests.generation import baselines, by_region, generate, summary, voting_summary
+from dora.sim.grasp_tests.report import check_out, print_report, write_report
 from dora.tasks.proving import TASKS, prove_shipped, usable_in_task
 
 INTERRUPTED = 130  # exit status after Ctrl-C

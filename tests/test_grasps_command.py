@@ -18,8 +18,8 @@ from dora.affordance.objects.catalogue import load_object
 from dora.affordance.search.optimise import Settings
 from dora.progress import PhaseProgress
 from dora.robot import load_robot
-from dora.sim import grasps
-from dora.sim.validation import Reason, Validation
+from dora.sim.grasp_tests import generation as grasps
+from dora.sim.grasp_tests.shake_test import Reason, Validation
 
 PACKAGE = Path(mani_skill.__file__).parent
 KEYS = {

@@ -3,7 +3,7 @@
 import pytest
 
 from dora.errors import InputError
-from dora.sim.rig import Physics
+from dora.sim.grasp_tests.test_scene import Physics
 from dora.tasks.physics import measure_physics, parse_physics
 
 

@@ -10,7 +10,7 @@ from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.objects.catalogue import load_object
 from dora.errors import InputError
 from dora.robot import load_robot
-from dora.sim.ranking import Execution, Purpose, lifts_of, rank
+from dora.sim.grasp_tests.lift_test import Execution, Purpose, lifts_of, rank
 
 ROBOT = load_robot("diana7_hit")
 CUBE = load_object("cube")
@@ -49,7 +49,8 @@ def test_draws_are_within_range_shared_by_candidates_and_new_for_reporting():
 def test_ranking_and_reporting_draw_differently_and_repeatably(monkeypatch: pytest.MonkeyPatch):
     seen = []
     monkeypatch.setattr(
-        "dora.sim.ranking.run_cases", lambda _, __, cases, *___: seen.append(cases[0].mass) or [True] * len(cases)
+        "dora.sim.grasp_tests.lift_test.run_cases",
+        lambda _, __, cases, *___: seen.append(cases[0].mass) or [True] * len(cases),
     )
     calls: list[tuple[Purpose, int]] = [("ranking", 0), ("reporting", 0), ("ranking", 0), ("ranking", 1)]
     for purpose, seed in calls:

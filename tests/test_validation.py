@@ -18,10 +18,10 @@ from dora.errors import InputError
 from dora.parallel import run_cases
 from dora.robot import load_robot
 from dora.sim import BACKEND
+from dora.sim.actors import build_object, object_entity
 from dora.sim.batch.scene import BatchScene
-from dora.sim.objects import build_object, object_entity
-from dora.sim.rig import Physics, Rig
-from dora.sim.validation import Reason, validate
+from dora.sim.grasp_tests.shake_test import Reason, validate
+from dora.sim.grasp_tests.test_scene import Physics, Rig
 
 ROBOT = load_robot("diana7_hit")
 CUBE = load_object("cube")

@@ -19,7 +19,7 @@ from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.feasibility import Reach
 from dora.affordance.reach.feasibility_table import Grid, ReachTable
 from dora.sim.properties import ObjectProperties
-from dora.sim.robot import DescribedRobot
+from dora.sim.robot_agent import DescribedRobot
 from dora.tasks.choice import Choice
 from dora.tasks.correction import Bounds, Correction
 from dora.tasks.disturbances import Disturbances

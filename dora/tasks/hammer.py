@@ -21,7 +21,7 @@ from dora.geometry.rotations import (
     quaternion_multiply,
     rotation_angle,
 )
-from dora.sim.objects import build_object
+from dora.sim.actors import build_object
 from dora.tasks.base import DoraEnv
 from dora.tasks.catchable import with_waiting_hand, within_reach
 from dora.tasks.catching import CatchReference

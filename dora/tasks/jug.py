@@ -19,7 +19,7 @@ from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.feasibility_table import Grid
 from dora.geometry.rotations import quaternion_apply
-from dora.sim.objects import build_object
+from dora.sim.actors import build_object
 from dora.tasks.base import STANDING_DRAWS, DoraEnv
 from dora.tasks.guidance import GraspReference
 from dora.tasks.observations import Entry

@@ -10,7 +10,7 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from dora.errors import InputError
 from dora.robot import available_robots
 from dora.sim.rendering import can_render
-from dora.sim.robot import CONTROL_MODES, COUPLED, DescribedRobot, register_robot
+from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot, register_robot
 from dora.tasks.presets import Preset, find_preset
 
 GUIDANCE = ("affordance", "none")

@@ -9,7 +9,7 @@ import torch
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from dora.errors import InputError
-from dora.sim.rig import Physics
+from dora.sim.grasp_tests.test_scene import Physics
 from dora.tasks import check_task_id, make_task
 from dora.tasks.base import DoraEnv
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from dora.geometry.rotations import quaternion_apply, quaternion_inverse
 from dora.sim.bodies import BodyReader
 from dora.sim.contacts import ContactMonitor, Contacts
-from dora.sim.robot import DescribedRobot
+from dora.sim.robot_agent import DescribedRobot
 from dora.tasks.episode import Episode
 from dora.tasks.guidance import Guide
 from dora.tasks.snapshot import CONTACT_CLASSES, FINGERS, Snapshot

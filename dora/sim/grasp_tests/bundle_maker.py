@@ -24,8 +24,8 @@ from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.progress import PhaseProgress
 from dora.robot import RobotDescription, load_robot
-from dora.sim.ranking import Execution, rank
-from dora.sim.validation import validate
+from dora.sim.grasp_tests.lift_test import Execution, rank
+from dora.sim.grasp_tests.shake_test import validate
 
 ROUND = 192
 """Candidates searched at a time for the target region."""

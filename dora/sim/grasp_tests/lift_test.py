@@ -27,8 +27,8 @@ from dora.geometry.rotations import (
 )
 from dora.parallel import Progress, run_cases
 from dora.robot import RobotDescription
-from dora.sim.rig import Physics, Rig
-from dora.sim.validation import check_object
+from dora.sim.grasp_tests.shake_test import check_object
+from dora.sim.grasp_tests.test_scene import Physics, Rig
 
 Purpose = Literal["ranking", "reporting"]
 _STREAM: dict[Purpose, int] = {"ranking": 0, "reporting": 1}

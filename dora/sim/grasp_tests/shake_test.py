@@ -21,8 +21,8 @@ from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion, quaternion_apply, quaternion_inverse
 from dora.parallel import Progress, run_cases
 from dora.robot import RobotDescription
-from dora.sim.grip import Grip
-from dora.sim.rig import Physics, Rig
+from dora.sim.grasp_tests.hand_contacts import Grip
+from dora.sim.grasp_tests.test_scene import Physics, Rig
 
 LOOK = 0.05
 """Time between measurements of the displacement [s]."""

@@ -12,9 +12,9 @@ from sapien import physx
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.errors import InputError
 from dora.robot import RobotDescription
-from dora.sim.grip import GripReader
-from dora.sim.hand import FloatingHand
-from dora.sim.objects import object_entity
+from dora.sim.actors import object_entity
+from dora.sim.grasp_tests.floating_hand import FloatingHand
+from dora.sim.grasp_tests.hand_contacts import GripReader
 
 TABLE_HALF = (1.0, 1.0, 0.05)
 """Half extents of the table [m]; its upper face is z = 0."""

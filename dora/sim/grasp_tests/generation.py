@@ -24,7 +24,7 @@ from dora.affordance.search.optimise import Settings, optimise
 from dora.parallel import warm_up
 from dora.progress import PhaseProgress
 from dora.robot import RobotDescription
-from dora.sim.validation import Validation, validate
+from dora.sim.grasp_tests.shake_test import Validation, validate
 
 MILLIMETRES = 1000.0
 """Per metre."""
