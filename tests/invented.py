@@ -5,7 +5,7 @@ from dataclasses import fields
 import torch
 from torch import Tensor
 
-from dora.tasks.snapshot import Snapshot
+from dora.tasks.mdp.snapshot import Snapshot
 
 SIZES = {
     "arm_q": 7, "hand_q": 20, "hand_v": 20, "hand_target": 20, "wrist_q": 4, "object_q": 4, "goal_q": 4,

@@ -9,8 +9,8 @@ import torch
 import dora.tasks as tasks
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
 from dora.sim.controllers import LIMIT_MARGIN
-from dora.tasks.base import DoraEnv
-from dora.tasks.correction import wrist_step
+from dora.tasks.env.base import DoraEnv
+from dora.tasks.guidance.residual_action import wrist_step
 
 PATH_STEPS = 60
 PATH_RADIUS = 0.06

@@ -9,7 +9,7 @@ from torch import Tensor
 
 import dora.tasks as tasks
 from dora.tasks import cube
-from dora.tasks.snapshot import Snapshot, derived
+from dora.tasks.mdp.snapshot import Snapshot, derived
 
 STARTS = 100
 """Random starts of the scripted grasp."""

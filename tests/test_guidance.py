@@ -10,12 +10,12 @@ import dora.tasks as tasks
 from dora.affordance.candidates import GraspCandidates
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector
-from dora.tasks.choice import Choice
-from dora.tasks.correction import SMOOTHING, Bounds, Correction, Target
-from dora.tasks.disturbances import SENSOR_DRAWS, Disturbances, uniform
-from dora.tasks.guidance import DESCEND, STANDOFF, GraspReference
-from dora.tasks.options import PARTS
-from dora.tasks.presets import PRESETS, Preset
+from dora.tasks.env.options import PARTS
+from dora.tasks.env.perturbations import SENSOR_DRAWS, Disturbances, uniform
+from dora.tasks.guidance.candidate_choice import Choice
+from dora.tasks.guidance.grasp_and_lift import DESCEND, STANDOFF, GraspReference
+from dora.tasks.guidance.residual_action import SMOOTHING, Bounds, Correction, Target
+from dora.tasks.mdp.randomisation import PRESETS, Preset
 
 CPU = torch.device("cpu")
 IDENTITY = torch.tensor([[1.0, 0.0, 0.0, 0.0]])

@@ -18,12 +18,23 @@ from dora.geometry.rotations import (
     rotation_angle,
 )
 from dora.sim.substeps import watch_physics
-from dora.tasks import hammer
-from dora.tasks.catching import ALIGN, PHASES, CatchReference
-from dora.tasks.hammer_judging import AFTER_OVERLAP
-from dora.tasks.hammer_snapshot import GRIP, HammerSnapshot, face_to_nail, handle_distance, misalignment
-from dora.tasks.hammering import Strike, arrival, blend, compose, fall_time, fallen, inverse, relative, slew, slid
-from dora.tasks.nail import BLOW_SPEED, TRAVEL
+from dora.tasks.hammer import env as hammer
+from dora.tasks.hammer.ballistics import (
+    Strike,
+    arrival,
+    blend,
+    compose,
+    fall_time,
+    fallen,
+    inverse,
+    relative,
+    slew,
+    slid,
+)
+from dora.tasks.hammer.nail import BLOW_SPEED, TRAVEL
+from dora.tasks.hammer.reference import ALIGN, PHASES, CatchReference
+from dora.tasks.hammer.rewards import AFTER_OVERLAP
+from dora.tasks.hammer.snapshot import GRIP, HammerSnapshot, face_to_nail, handle_distance, misalignment
 
 FACE = (0.04, 0.0, 0.04)
 SCALARS = ("nail_depth", "nail_driven", "drift_p", "drift_r")

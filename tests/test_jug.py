@@ -10,7 +10,7 @@ from torch import Tensor
 import dora.tasks as tasks
 from dora.affordance.objects.catalogue import load_object
 from dora.tasks import jug
-from dora.tasks.snapshot import CONTACT_CLASSES, Snapshot
+from dora.tasks.mdp.snapshot import CONTACT_CLASSES, Snapshot
 
 STARTS = 100
 """Random starts of the scripted grasp."""

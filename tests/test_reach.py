@@ -36,8 +36,8 @@ from dora.robot.motion.height_bounds import ArmExtent, HandExtent
 from dora.robot.motion.inverse_kinematics import ANGLE_TOLERANCE, POSITION_TOLERANCE, InverseKinematics
 from dora.robot.motion.planning import densified
 from dora.sim import controllers
-from dora.tasks import guidance
-from dora.tasks.building import BuiltEnv
+from dora.tasks.env.building import BuiltEnv
+from dora.tasks.guidance import grasp_and_lift as guidance
 
 GRASPED = (0.06, 0.006, 0.12)
 """Middle of what a hand holds, in the wrist frame [m]."""

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from dora.tasks.rewards import Term, Terms, closeness
-from dora.tasks.stages import Stage, StageMachine
+from dora.tasks.mdp.rewards import Term, Terms, closeness
+from dora.tasks.mdp.stages import Stage, StageMachine
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import dora.tasks as tasks
 from dora.errors import InputError
-from dora.tasks.base import DoraEnv
+from dora.tasks.env.base import DoraEnv
 
 BATCH = 6
 """Environments in a batch."""

@@ -7,9 +7,9 @@ import gymnasium as gym
 
 from dora.errors import InputError
 from dora.tasks import cube as cube
-from dora.tasks import hammer as hammer
 from dora.tasks import jug as jug
-from dora.tasks.base import DoraEnv
+from dora.tasks.env.base import DoraEnv
+from dora.tasks.hammer import env as hammer
 
 
 def task_ids() -> list[str]:

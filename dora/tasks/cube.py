@@ -14,12 +14,9 @@ from torch import Tensor
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.reach.feasibility_table import Grid
 from dora.geometry.rotations import quaternion_apply, quaternion_multiply
-from dora.tasks.base import STANDING_DRAWS, DoraEnv
-from dora.tasks.observations import Entry
-from dora.tasks.rewards import Term, Terms, closeness
-from dora.tasks.snapshot import TIP_RADIUS, Snapshot, derived, lifted, opposed, tips_in_object
-from dora.tasks.stages import Stage
-from dora.tasks.terms import (
+from dora.tasks.env.base import STANDING_DRAWS, DoraEnv
+from dora.tasks.mdp.observations import Entry
+from dora.tasks.mdp.reward_terms import (
     at_candidate,
     grip,
     near_region,
@@ -32,6 +29,9 @@ from dora.tasks.terms import (
     rise,
     thumb_and_finger,
 )
+from dora.tasks.mdp.rewards import Term, Terms, closeness
+from dora.tasks.mdp.snapshot import TIP_RADIUS, Snapshot, derived, lifted, opposed, tips_in_object
+from dora.tasks.mdp.stages import Stage
 
 HALF = 0.03
 """Nominal half edge of the cube [m]."""

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from dora.tasks import make_task, task_ids
-from dora.tasks.base import DoraEnv
-from dora.tasks.presets import PRESETS
+from dora.tasks.env.base import DoraEnv
+from dora.tasks.mdp.randomisation import PRESETS
 
 BEGIN, END = "<!-- generated: begin -->", "<!-- generated: end -->"
 

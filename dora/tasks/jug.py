@@ -20,23 +20,11 @@ from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.feasibility_table import Grid
 from dora.geometry.rotations import quaternion_apply
 from dora.sim.actors import build_object
-from dora.tasks.base import STANDING_DRAWS, DoraEnv
-from dora.tasks.guidance import GraspReference
-from dora.tasks.observations import Entry
-from dora.tasks.reference import Reference
-from dora.tasks.rewards import Term, Terms, closeness
-from dora.tasks.snapshot import (
-    TIP_RADIUS,
-    Snapshot,
-    derived,
-    derived_from_contacts,
-    in_wrist,
-    lifted,
-    opposed,
-    tips_in_object,
-)
-from dora.tasks.stages import Stage
-from dora.tasks.terms import (
+from dora.tasks.env.base import STANDING_DRAWS, DoraEnv
+from dora.tasks.guidance.grasp_and_lift import GraspReference
+from dora.tasks.guidance.reference import Reference
+from dora.tasks.mdp.observations import Entry
+from dora.tasks.mdp.reward_terms import (
     at_candidate,
     grip,
     near_region,
@@ -49,6 +37,18 @@ from dora.tasks.terms import (
     rise,
     thumb_and_finger,
 )
+from dora.tasks.mdp.rewards import Term, Terms, closeness
+from dora.tasks.mdp.snapshot import (
+    TIP_RADIUS,
+    Snapshot,
+    derived,
+    derived_from_contacts,
+    in_wrist,
+    lifted,
+    opposed,
+    tips_in_object,
+)
+from dora.tasks.mdp.stages import Stage
 
 EMPTY, FULL = 0.30, 0.60
 """Mass of the empty and of the full jug [kg]."""

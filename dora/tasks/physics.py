@@ -11,7 +11,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from dora.errors import InputError
 from dora.sim.grasp_tests.test_scene import Physics
 from dora.tasks import check_task_id, make_task
-from dora.tasks.base import DoraEnv
+from dora.tasks.env.base import DoraEnv
 
 TUNNELLED = 0.010
 """Overlap at which a body is more inside another one than outside: about the radius of a finger or a handle [m]."""

@@ -19,7 +19,7 @@ from dora.affordance.objects.catalogue import load_object
 from dora.affordance.search.optimise import OFF_TABLE
 from dora.parallel import run_cases
 from dora.tasks import make_task
-from dora.tasks.base import DoraEnv
+from dora.tasks.env.base import DoraEnv
 
 TASKS = {"cube": "DoraCube-v1", "jug": "DoraJug-v1", "hammer": "DoraHammer-v1"}
 """The task in which the grasps of an object are executed."""

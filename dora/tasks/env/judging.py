@@ -8,13 +8,13 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from torch import Tensor
 
-from dora.tasks.episode import Episode
-from dora.tasks.guidance import Guide
-from dora.tasks.observations import OBSERVATIONS, Entry
-from dora.tasks.options import FILTER, REWARD
-from dora.tasks.rewards import Terms
-from dora.tasks.snapshot import Snapshot
-from dora.tasks.stages import Stage, StageMachine
+from dora.tasks.env.episode_memory import Episode
+from dora.tasks.env.options import FILTER, REWARD
+from dora.tasks.guidance.grasp_and_lift import Guide
+from dora.tasks.mdp.observations import OBSERVATIONS, Entry
+from dora.tasks.mdp.rewards import Terms
+from dora.tasks.mdp.snapshot import Snapshot
+from dora.tasks.mdp.stages import Stage, StageMachine
 
 MM = 1000.0
 """Millimetres per metre."""

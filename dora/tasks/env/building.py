@@ -20,16 +20,16 @@ from dora.affordance.reach.feasibility import Reach
 from dora.affordance.reach.feasibility_table import Grid, ReachTable
 from dora.sim.properties import ObjectProperties
 from dora.sim.robot_agent import DescribedRobot
-from dora.tasks.choice import Choice
-from dora.tasks.correction import Bounds, Correction
-from dora.tasks.disturbances import Disturbances
-from dora.tasks.episode import Episode
-from dora.tasks.guidance import GraspReference, Guide
-from dora.tasks.judging import JudgedEnv
-from dora.tasks.options import PRIOR, check_options
-from dora.tasks.reading import SimulatorReader
-from dora.tasks.reference import Reference
-from dora.tasks.scene import add_table
+from dora.tasks.env.episode_memory import Episode
+from dora.tasks.env.judging import JudgedEnv
+from dora.tasks.env.options import PRIOR, check_options
+from dora.tasks.env.perturbations import Disturbances
+from dora.tasks.env.state_reader import SimulatorReader
+from dora.tasks.env.table import add_table
+from dora.tasks.guidance.candidate_choice import Choice
+from dora.tasks.guidance.grasp_and_lift import GraspReference, Guide
+from dora.tasks.guidance.reference import Reference
+from dora.tasks.guidance.residual_action import Bounds, Correction
 
 SCALE_DRAW = 256
 """Which number of an environment's stream is its size: episodes begin with the same numbers, and use fewer."""
@@ -43,7 +43,7 @@ class BuiltEnv(JudgedEnv):
         guidance_parts: which parts of guidance="affordance" are in force, among "observation", "reward", "filter"
             and "prior"; all by default.
         hand_joints: 20 independent hand targets, or 15 with distal joints coupled to medial ones.
-        preset: how much episodes are randomised, see `dora.tasks.presets`.
+        preset: how much episodes are randomised, see `dora.tasks.mdp.randomisation`.
         grasps: candidates in place of those that come with Dora, of the task's object and robot.
         robot_uids: name of a folder in `robots/`.
         sim_backend: as in ManiSkill; "auto" on a machine without CUDA is "physx_cpu", or "physx_cpu_batch" for

@@ -10,8 +10,8 @@ from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand.protocol import flexion
 from dora.geometry.rotations import quaternion_apply, rotation_angle
 from dora.robot import RobotDescription
-from dora.tasks.choice import in_world
-from dora.tasks.hammering import slid
+from dora.tasks.guidance.candidate_choice import in_world
+from dora.tasks.hammer.ballistics import slid
 
 REACH = (0.16, 0.16)
 """Half extents of the area around the start in which the wrist waits for the hammer [m]."""

@@ -13,8 +13,8 @@ from dora.geometry.rotations import (
     quaternion_inverse,
     quaternion_multiply,
 )
-from dora.tasks.options import OBSERVATION, PRIOR
-from dora.tasks.snapshot import Snapshot, goal_error, in_wrist, lifted, near_errors, turned_in_wrist
+from dora.tasks.env.options import OBSERVATION, PRIOR
+from dora.tasks.mdp.snapshot import Snapshot, goal_error, in_wrist, lifted, near_errors, turned_in_wrist
 
 FASTEST_SPIN = 30.0
 """Spin of an object that is still told apart, about each axis [rad/s]; a slender one that is hit spins faster."""

@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dora.tasks.correction import Target
-from dora.tasks.snapshot import Snapshot
-from dora.tasks.stages import Stage, StageMachine
+from dora.tasks.guidance.residual_action import Target
+from dora.tasks.mdp.snapshot import Snapshot
+from dora.tasks.mdp.stages import Stage, StageMachine
 
 
 class Reference(ABC):

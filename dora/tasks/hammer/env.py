@@ -22,11 +22,14 @@ from dora.geometry.rotations import (
     rotation_angle,
 )
 from dora.sim.actors import build_object
-from dora.tasks.base import DoraEnv
-from dora.tasks.catchable import with_waiting_hand, within_reach
-from dora.tasks.catching import CatchReference
-from dora.tasks.hammer_judging import DEEPEST, PAPER_TERMS, STAGES, TERMS
-from dora.tasks.hammer_snapshot import (
+from dora.tasks.env.base import DoraEnv
+from dora.tasks.guidance.reference import Reference
+from dora.tasks.hammer.ballistics import Strike, relative
+from dora.tasks.hammer.nail import Nail
+from dora.tasks.hammer.reach import with_waiting_hand, within_reach
+from dora.tasks.hammer.reference import CatchReference
+from dora.tasks.hammer.rewards import DEEPEST, PAPER_TERMS, STAGES, TERMS
+from dora.tasks.hammer.snapshot import (
     HammerSnapshot,
     face_to_nail,
     handle_axis,
@@ -34,11 +37,8 @@ from dora.tasks.hammer_snapshot import (
     striking_axis,
     tip_distance,
 )
-from dora.tasks.hammering import Strike, relative
-from dora.tasks.nail import Nail
-from dora.tasks.observations import Entry
-from dora.tasks.reference import Reference
-from dora.tasks.snapshot import Snapshot, turned_in_wrist
+from dora.tasks.mdp.observations import Entry
+from dora.tasks.mdp.snapshot import Snapshot, turned_in_wrist
 
 NAIL_TOP = (0.65, -0.14, 0.30)
 """Top of the undriven nail [m]."""

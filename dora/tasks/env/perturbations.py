@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
-from dora.tasks.choice import Choice
-from dora.tasks.presets import Preset
-from dora.tasks.snapshot import S, observed
+from dora.tasks.guidance.candidate_choice import Choice
+from dora.tasks.mdp.randomisation import Preset
+from dora.tasks.mdp.snapshot import S, observed
 
 KEYS = 2**24
 """Number of different keys; each is exact in a float, as which states are stored."""

@@ -15,11 +15,11 @@ from torch import Tensor
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector
 from dora.sim.batch.actions import check_action
-from dora.tasks.building import SCALE_DRAW, BuiltEnv
-from dora.tasks.choice import ERROR_DRAWS
-from dora.tasks.correction import Target, wrist_step
-from dora.tasks.options import FILTER
-from dora.tasks.snapshot import Snapshot, advanced, lifted
+from dora.tasks.env.building import SCALE_DRAW, BuiltEnv
+from dora.tasks.env.options import FILTER
+from dora.tasks.guidance.candidate_choice import ERROR_DRAWS
+from dora.tasks.guidance.residual_action import Target, wrist_step
+from dora.tasks.mdp.snapshot import Snapshot, advanced, lifted
 
 TRIES = 8
 """Starting poses that are drawn for an object that stands."""

@@ -20,13 +20,13 @@ from dora.geometry.rotations import (
     rotation_angle,
     rotation_vector_from_quaternion,
 )
-from dora.tasks.catchable import REACH, TURN
-from dora.tasks.correction import Target
-from dora.tasks.hammer_snapshot import HammerSnapshot
-from dora.tasks.hammering import Pose, Strike, arrival, blend, compose, fallen, inverse, relative, slew, slid
-from dora.tasks.nail import DRIVEN
-from dora.tasks.reference import Reference
-from dora.tasks.stages import Stage
+from dora.tasks.guidance.reference import Reference
+from dora.tasks.guidance.residual_action import Target
+from dora.tasks.hammer.ballistics import Pose, Strike, arrival, blend, compose, fallen, inverse, relative, slew, slid
+from dora.tasks.hammer.nail import DRIVEN
+from dora.tasks.hammer.reach import REACH, TURN
+from dora.tasks.hammer.snapshot import HammerSnapshot
+from dora.tasks.mdp.stages import Stage
 
 LEAD = 0.125
 """Time from the beginning of the catch until the fingers hold the handle [s]."""

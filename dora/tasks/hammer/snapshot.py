@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.geometry.rotations import quaternion_apply, quaternion_inverse
-from dora.tasks.snapshot import TIP_RADIUS, Snapshot, derived, in_wrist
+from dora.tasks.mdp.snapshot import TIP_RADIUS, Snapshot, derived, in_wrist
 
 GRIP = (0.045, 0.0, 0.150)
 """Middle of a closed grip in the hand frame [m]."""

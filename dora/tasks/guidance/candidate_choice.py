@@ -11,7 +11,7 @@ from dora.geometry.rotations import (
     quaternion_multiply,
     rotation_angle,
 )
-from dora.tasks.presets import Preset
+from dora.tasks.mdp.randomisation import Preset
 
 NEAREST = 3
 """Candidates that an environment observes; the first one leads the reference."""

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dora.tasks.rewards import Term, closeness
-from dora.tasks.snapshot import Snapshot, goal_error, lifted, opposed
+from dora.tasks.mdp.rewards import Term, closeness
+from dora.tasks.mdp.snapshot import Snapshot, goal_error, lifted, opposed
 
 ALPHA = 4.0
 """Spatial sensitivity of the affordance reward [1/m]."""

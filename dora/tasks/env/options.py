@@ -11,7 +11,7 @@ from dora.errors import InputError
 from dora.robot import available_robots
 from dora.sim.rendering import can_render
 from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot, register_robot
-from dora.tasks.presets import Preset, find_preset
+from dora.tasks.mdp.randomisation import Preset, find_preset
 
 GUIDANCE = ("affordance", "none")
 OBSERVATION, REWARD, FILTER, PRIOR = PARTS = ("observation", "reward", "filter", "prior")

@@ -5,7 +5,8 @@ from math import pi
 import torch
 from torch import Tensor
 
-from dora.tasks.hammer_snapshot import (
+from dora.tasks.hammer.nail import DRIVEN
+from dora.tasks.hammer.snapshot import (
     IN_HAND,
     HammerSnapshot,
     face_to_nail,
@@ -15,10 +16,16 @@ from dora.tasks.hammer_snapshot import (
     relative_speed,
     tip_distance,
 )
-from dora.tasks.nail import DRIVEN
-from dora.tasks.rewards import Term, Terms, closeness
-from dora.tasks.stages import Stage
-from dora.tasks.terms import at_candidate, near_region, paper_affordance, paper_grasp, paper_penalty, penalties
+from dora.tasks.mdp.reward_terms import (
+    at_candidate,
+    near_region,
+    paper_affordance,
+    paper_grasp,
+    paper_penalty,
+    penalties,
+)
+from dora.tasks.mdp.rewards import Term, Terms, closeness
+from dora.tasks.mdp.stages import Stage
 
 CAUGHT_SPEED = 0.5
 """Speed of the hammer in the hand below which it has been caught [m/s]."""

@@ -1,7 +1,7 @@
 """Guidance: what affordances and grasp candidates add to a task, part by part, and the reference that grasps.
 
 The grasp reference follows the chosen candidate relative to the *live* object as it is observed: approach at a
-standoff, descend, close the fingers, lift. The policy corrects it, see `dora.tasks.correction`.
+standoff, descend, close the fingers, lift. The policy corrects it, see `dora.tasks.guidance.residual_action`.
 """
 
 from collections.abc import Callable, Iterable
@@ -13,11 +13,11 @@ from torch import Tensor
 
 from dora.errors import InputError
 from dora.geometry.rotations import rotation_angle
-from dora.tasks.choice import Choice
-from dora.tasks.correction import Correction, Target
-from dora.tasks.reference import Reference
-from dora.tasks.snapshot import Snapshot
-from dora.tasks.stages import Stage
+from dora.tasks.guidance.candidate_choice import Choice
+from dora.tasks.guidance.reference import Reference
+from dora.tasks.guidance.residual_action import Correction, Target
+from dora.tasks.mdp.snapshot import Snapshot
+from dora.tasks.mdp.stages import Stage
 
 STANDOFF = 0.10
 """Distance from the candidate's wrist position while approaching [m]."""
@@ -161,7 +161,7 @@ class Guide:
     """The parts of guidance that a task has in force, and what they work with.
 
     Args:
-        parts: which of `dora.tasks.options.PARTS`.
+        parts: which of `dora.tasks.env.options.PARTS`.
         choice: the candidates in use.
         reference: leads the hand.
         correction: what the action does to the reference.

@@ -12,10 +12,10 @@ from dora.geometry.rotations import quaternion_apply, quaternion_inverse
 from dora.sim.bodies import BodyReader
 from dora.sim.contacts import ContactMonitor, Contacts
 from dora.sim.robot_agent import DescribedRobot
-from dora.tasks.episode import Episode
-from dora.tasks.guidance import Guide
-from dora.tasks.snapshot import CONTACT_CLASSES, FINGERS, Snapshot
-from dora.tasks.stages import StageMachine
+from dora.tasks.env.episode_memory import Episode
+from dora.tasks.guidance.grasp_and_lift import Guide
+from dora.tasks.mdp.snapshot import CONTACT_CLASSES, FINGERS, Snapshot
+from dora.tasks.mdp.stages import StageMachine
 
 TIPS = slice(1, 1 + len(FINGERS))
 """Places of the distal links among the bodies whose poses are read: after the wrist, before the object."""

@@ -1,0 +1,1 @@
+"""The environment around a task: scene, reading the simulator, memory of the episode, perturbations."""

@@ -1,0 +1,1 @@
+"""DoraHammer-v1: catch a falling hammer, bring it over a nail, and drive the nail in."""
