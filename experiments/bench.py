@@ -6,12 +6,12 @@ import sys
 
 import tyro
 
-from dora.affordance import benchmark as grasp_benchmark
 from dora.errors import InputError
 from dora.progress import PhaseProgress
 from dora.robot import load_robot
-from dora.sim import benchmark
-from dora.tasks import physics as task_physics
+from dora.tools import env_benchmark as benchmark
+from dora.tools import grasp_benchmark
+from dora.tools import physics_benchmark as task_physics
 
 app = tyro.extras.SubcommandApp()
 

@@ -23,7 +23,7 @@ from dora.robot import load_robot
 from dora.sim.grasp_tests.bundle_maker import ship
 from dora.sim.grasp_tests.generation import baselines, by_region, generate, summary, voting_summary
 from dora.sim.grasp_tests.report import check_out, print_report, write_report
-from dora.tasks.proving import TASKS, prove_shipped, usable_in_task
+from dora.tools.task_ranking import TASKS, prove_shipped, usable_in_task
 
 INTERRUPTED = 130  # exit status after Ctrl-C
 BAD_INPUT = 2  # exit status after input that a person can mend

@@ -11,7 +11,7 @@ import torch
 
 import dora.tasks as tasks
 from dora.errors import InputError
-from dora.tasks.demonstrations import record_demonstrations
+from dora.tools.demonstrations import record_demonstrations
 
 
 def test_successes_are_recorded_and_can_be_played_again(tmp_path: Path):

@@ -7,8 +7,6 @@ import pytest
 import torch
 from numpy.testing import assert_allclose
 
-from dora.affordance import benchmark
-from dora.affordance.benchmark import GraspBenchmark, measure
 from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.objects.signed_distance import SignedDistanceField
@@ -21,6 +19,8 @@ from dora.affordance.search.optimise import table_of
 from dora.affordance.search.search import Search, Settings
 from dora.errors import InputError
 from dora.robot import load_robot
+from dora.tools import grasp_benchmark as benchmark
+from dora.tools.grasp_benchmark import GraspBenchmark, measure
 
 ROBOT = load_robot("diana7_hit")
 COUNT = 16

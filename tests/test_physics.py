@@ -4,7 +4,7 @@ import pytest
 
 from dora.errors import InputError
 from dora.sim.grasp_tests.test_scene import Physics
-from dora.tasks.physics import measure_physics, parse_physics
+from dora.tools.physics_benchmark import measure_physics, parse_physics
 
 
 def test_settings_are_read_in_hertz_and_millimetres():

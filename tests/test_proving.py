@@ -8,7 +8,7 @@ import torch
 from dora.affordance.bundled_sets import data_folder, load_candidates
 from dora.affordance.candidates import concatenate
 from dora.tasks import make_task
-from dora.tasks.proving import TASKS, Proof, _Balanced, prove, ranked
+from dora.tools.task_ranking import TASKS, Proof, _Balanced, prove, ranked
 
 
 def test_a_proof_tells_a_good_grasp_from_one_in_the_air():

@@ -1,4 +1,4 @@
-"""Tables of tasks and presets, written from the code: `python -m dora.tasks.document` refreshes docs/.
+"""Tables of tasks and presets, written from the code: `python -m dora.tools.task_pages` refreshes docs/.
 
 Each page keeps its hand-written part; what stands between the two marks is replaced.
 """

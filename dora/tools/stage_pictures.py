@@ -1,4 +1,4 @@
-"""What the stages of a task look like: `python -m dora.tasks.stage_pictures` draws docs/images/<task>-stages.png.
+"""What the stages of a task look like: `python -m dora.tools.stage_pictures` draws docs/images/<task>-stages.png.
 
 Needs a Vulkan driver (docs/rendering.md).
 """
@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from dora.errors import InputError
 from dora.sim.rendering import can_render
 from dora.tasks import make_task, task_ids
-from dora.tasks.document import short_name
+from dora.tools.task_pages import short_name
 
 SEEDS = range(1, 21)
 """Starts that are tried, in order, until the scripted solution completes all stages (at 0 the jug hides its handle)."""
