@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from dora.agents.report import write_report
+from dora.agents.runs.report import write_report
 from dora.errors import InputError
 
 

@@ -17,13 +17,13 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from dora.agents.checkpoint import read_checkpoint
-from dora.agents.config import RunConfig
-from dora.agents.evaluate import outcome
-from dora.agents.play import checkpoint_path, evaluate_checkpoint, load_policy, record
-from dora.agents.presets import recommended, with_total_steps
-from dora.agents.runfolder import RunFolder, make_result
-from dora.agents.trainer import Trainer
+from dora.agents.evaluation.evaluate import outcome
+from dora.agents.evaluation.play import checkpoint_path, evaluate_checkpoint, load_policy, record
+from dora.agents.runs.checkpoint import read_checkpoint
+from dora.agents.runs.config import RunConfig
+from dora.agents.runs.presets import recommended, with_total_steps
+from dora.agents.runs.run_folder import RunFolder, make_result
+from dora.agents.runs.trainer import Trainer
 from dora.errors import InputError
 from dora.tasks import check_task_id, make_task
 

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
-from dora.agents.env import EpisodeColumns, TaskEnv, ended_episodes
+from dora.agents.collecting.task_env import EpisodeColumns, TaskEnv, ended_episodes
 
 
 def rollout(env: TaskEnv, steps: int) -> TensorDict:

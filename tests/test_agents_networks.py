@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from dora.agents.networks import GaussianActor, Normaliser, Policy, TanhActor
-from dora.agents.ppo import advantages
+from dora.agents.learners.networks import GaussianActor, Normaliser, Policy, TanhActor
+from dora.agents.learners.ppo import advantages
 
 
 def test_normaliser_agrees_with_numpy():

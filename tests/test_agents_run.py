@@ -7,11 +7,11 @@ from types import ModuleType
 import pytest
 from commands import call, load_command
 
-from dora.agents.checkpoint import read_checkpoint
-from dora.agents.config import LEARNER_CONFIGS
-from dora.agents.play import load_policy
-from dora.agents.presets import PRESETS, recommended
-from dora.agents.runfolder import RunFolder
+from dora.agents.evaluation.play import load_policy
+from dora.agents.runs.checkpoint import read_checkpoint
+from dora.agents.runs.config import LEARNER_CONFIGS
+from dora.agents.runs.presets import PRESETS, recommended
+from dora.agents.runs.run_folder import RunFolder
 
 SHIPPED = sorted((Path(__file__).parents[1] / "results").rglob("policy.safetensors"))
 """Policies of the results that the README shows."""

@@ -17,15 +17,15 @@ import torch
 from fake_task import PointMass
 from torch import Tensor
 
-from dora.agents.checkpoint import read_checkpoint
-from dora.agents.collect import Rollouts
-from dora.agents.config import PPOConfig, RunConfig, SACConfig
-from dora.agents.logging import TAGS
-from dora.agents.networks import last_layer
-from dora.agents.play import evaluate_checkpoint, record
-from dora.agents.ppo import PPO
-from dora.agents.runfolder import RunFolder
-from dora.agents.trainer import Trainer
+from dora.agents.collecting.rollouts import Rollouts
+from dora.agents.evaluation.play import evaluate_checkpoint, record
+from dora.agents.learners.networks import last_layer
+from dora.agents.learners.ppo import PPO
+from dora.agents.runs.checkpoint import read_checkpoint
+from dora.agents.runs.config import PPOConfig, RunConfig, SACConfig
+from dora.agents.runs.logging import TAGS
+from dora.agents.runs.run_folder import RunFolder
+from dora.agents.runs.trainer import Trainer
 from dora.errors import InputError
 
 RESULT_KEYS = [
@@ -194,8 +194,8 @@ SCRIPT = """
 import dataclasses, sys
 from pathlib import Path
 from fake_task import PointMass
-from dora.agents.runfolder import RunFolder
-from dora.agents.trainer import Trainer
+from dora.agents.runs.run_folder import RunFolder
+from dora.agents.runs.trainer import Trainer
 from test_agents_train import BASE, SMALL_PPO
 if __name__ == "__main__":
     resume, total = sys.argv[2] == "resume", int(sys.argv[3])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from dora.agents.report import find_runs, tables, write_report
+from dora.agents.runs.report import find_runs, tables, write_report
 from dora.errors import InputError
 
 

@@ -16,8 +16,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector, MultiSyncCollector
 
-from dora.agents.env import Task, TaskEnv, TaskFactory
-from dora.agents.networks import Policy
+from dora.agents.collecting.task_env import Task, TaskEnv, TaskFactory
+from dora.agents.learners.networks import Policy
 from dora.errors import InputError
 
 SHUTDOWN_SECONDS = 10.0  # workers that have not ended by then are killed

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dora.agents.checkpoint import (
+from dora.agents.runs.checkpoint import (
     Checkpoint,
     check_belongs,
     pack_modules,
@@ -22,16 +22,16 @@ from dora.agents.checkpoint import (
     unpack_optimisers,
     unpack_rng,
 )
-from dora.agents.collect import Rollouts
-from dora.agents.config import RunConfig
-from dora.agents.env import EpisodeColumns, Task, ended_episodes
-from dora.agents.evaluate import PERIODIC_SEED, Evaluation, outcome
-from dora.agents.evaluators import Evaluators
-from dora.agents.interrupt import Interrupt
-from dora.agents.learner import Learner, make_learner
-from dora.agents.logging import RunLog
-from dora.agents.progress import ProgressReport
-from dora.agents.runfolder import RunFolder, make_result
+from dora.agents.collecting.rollouts import Rollouts
+from dora.agents.runs.config import RunConfig
+from dora.agents.collecting.task_env import EpisodeColumns, Task, ended_episodes
+from dora.agents.evaluation.evaluate import PERIODIC_SEED, Evaluation, outcome
+from dora.agents.evaluation.evaluators import Evaluators
+from dora.agents.runs.interrupt import Interrupt
+from dora.agents.learners.learner import Learner, make_learner
+from dora.agents.runs.logging import RunLog
+from dora.agents.runs.progress import ProgressReport
+from dora.agents.runs.run_folder import RunFolder, make_result
 
 TRAINING_SEEDS = 1_000_000_000  # seeds of training are below, those of evaluation above
 RECENT = 200  # training episodes over which the shown success rate is taken

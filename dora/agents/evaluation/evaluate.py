@@ -9,7 +9,7 @@ from jaxtyping import Float
 from tensordict import TensorDict
 from torch import Tensor
 
-from dora.agents.env import EpisodeColumns, TaskEnv
+from dora.agents.collecting.task_env import EpisodeColumns, TaskEnv
 
 PERIODIC_SEED = 1_000_000_000  # first episode seed of evaluations during training; training seeds are below
 FINAL_SEED = 1_500_000_000  # first episode seed of the evaluation that a result reports

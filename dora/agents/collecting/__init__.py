@@ -1,0 +1,1 @@
+"""From tasks to batches: the TorchRL environment and the worker processes that roll policies out."""

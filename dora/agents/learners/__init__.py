@@ -1,0 +1,1 @@
+"""The algorithms, each readable from top to bottom, with their networks and the replay buffer."""
