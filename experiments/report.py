@@ -1,37 +1,8 @@
-"""Tables and figures of finished runs: `python experiments/report.py DIR`."""
+"""Tables and figures of finished runs: see `dora.commands.report`, or --help."""
 
 import sys
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
-import tyro
-
-from dora.agents.runs.report import write_report
-from dora.errors import InputError
-
-
-@dataclass
-class Arguments:
-    """Makes tables.md, report.html and one figure per task from the runs under a folder."""
-
-    dir: Annotated[Path, tyro.conf.Positional]
-    """Folder that is searched for result.json files."""
-    out: Path | None = None
-    """Folder for the report; the searched folder by default."""
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Returns the exit status: 0, or 2 for bad input."""
-    arguments = tyro.cli(Arguments, args=argv)
-    try:
-        for path in write_report(arguments.dir, arguments.out or arguments.dir):
-            print(path)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
-
+from dora.commands.report import main
 
 if __name__ == "__main__":
     sys.exit(main())

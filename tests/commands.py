@@ -1,6 +1,6 @@
-"""The scripts in `experiments/` as modules, so that tests can call them with arguments of their own."""
+"""Commands called with arguments of a test's own, and the scripts that stand before them."""
 
-import importlib.util
+import importlib
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -11,17 +11,11 @@ EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 
 
 def load_command(name: str) -> ModuleType:
-    """The module of `experiments/<name>.py`."""
-    spec = importlib.util.spec_from_file_location(f"{name}_script", EXPERIMENTS / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[f"{name}_script"] = module
-    spec.loader.exec_module(module)
-    return module
+    """The body of `experiments/<name>.py`."""
+    return importlib.import_module(f"dora.commands.{name}")
 
 
-def call(script: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+def call(command: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     """Exit status of a command called with these arguments."""
-    monkeypatch.setattr(sys, "argv", [script.__name__, *arguments])
-    return script.main()
+    monkeypatch.setattr(sys, "argv", [command.__name__, *arguments])
+    return command.main()

@@ -15,7 +15,8 @@ from dora.affordance.maps.affordance_map import COUNT, AffordanceMap
 from dora.affordance.maps.nearest_points import NearestTable, nearest_by_comparison
 from dora.affordance.maps.poisson_disk import sample_evenly
 from dora.affordance.objects.catalogue import load_object
-from dora.affordance.views.palette import PALETTE
+from dora.affordance.objects.palette import PALETTE
+from dora.affordance.views.map_pictures import export_glb, picture_map
 from dora.errors import InputError
 
 NAMES = ("cube", "jug", "hammer", "microwave")
@@ -190,7 +191,7 @@ def test_map_moves_to_a_device(maps: dict[str, AffordanceMap]):
 
 def test_picture_shows_every_region(tmp_path, maps: dict[str, AffordanceMap]):
     path = tmp_path / "jug.png"
-    maps["jug"].picture(path, size=160)
+    picture_map(maps["jug"], path, size=160)
     picture = imageio.imread(path)[..., :3]
     assert picture.shape[1] == 480
     assert 160 < picture.shape[0] < 300  # titles and legend
@@ -200,12 +201,12 @@ def test_picture_shows_every_region(tmp_path, maps: dict[str, AffordanceMap]):
         wanted = np.array(color) / max(color)
         assert (np.abs(hue - wanted).max(1) < 0.1).sum() > 1500
     with pytest.raises(InputError, match="Cannot write"):
-        maps["jug"].picture(tmp_path / "nowhere" / "jug.png", size=40)
+        picture_map(maps["jug"], tmp_path / "nowhere" / "jug.png", size=40)
 
 
 def test_glb_has_the_coloured_surface(tmp_path, maps: dict[str, AffordanceMap]):
     path = tmp_path / "jug.glb"
-    maps["jug"].export_glb(path)
+    export_glb(maps["jug"], path)
     mesh = trimesh.load_mesh(path)
     assert len(mesh.faces) == len(maps["jug"].mesh.faces)
     np.testing.assert_allclose(mesh.extents, maps["jug"].mesh.extents, atol=1e-6)

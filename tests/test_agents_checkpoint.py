@@ -11,10 +11,10 @@ import torch
 from safetensors.torch import save_file
 from tensordict import TensorDict
 
+from dora.agents.checkpoint import Checkpoint, check_belongs, read_checkpoint
+from dora.agents.config import RunConfig
 from dora.agents.learners import replay as replay_module
 from dora.agents.learners.replay import Replay
-from dora.agents.runs.checkpoint import Checkpoint, check_belongs, read_checkpoint
-from dora.agents.runs.config import RunConfig
 from dora.errors import InputError
 from dora.files import write_bytes
 

@@ -13,9 +13,9 @@ import torch
 from fake_task import PointMass
 from torch import Tensor
 
+from dora.agents.config import PPOConfig, RunConfig
 from dora.agents.evaluation.evaluators import HELPER, Evaluators
 from dora.agents.learners.learner import make_learner
-from dora.agents.runs.config import PPOConfig, RunConfig
 from dora.errors import InputError
 
 EPISODES = 30

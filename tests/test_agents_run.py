@@ -7,9 +7,9 @@ from types import ModuleType
 import pytest
 from commands import call, load_command
 
+from dora.agents.checkpoint import read_checkpoint
+from dora.agents.config import LEARNER_CONFIGS
 from dora.agents.evaluation.play import load_policy
-from dora.agents.runs.checkpoint import read_checkpoint
-from dora.agents.runs.config import LEARNER_CONFIGS
 from dora.agents.runs.presets import PRESETS, recommended
 from dora.agents.runs.run_folder import RunFolder
 

@@ -4,9 +4,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from dora.agents.config import SACConfig
 from dora.agents.learners.networks import TanhActor
 from dora.agents.learners.sac import SAC, multi_step
-from dora.agents.runs.config import SACConfig
 from dora.agents.runs.presets import recommended
 
 ROWS, LENGTH, OBSERVATION, ACTION = 4, 16, 3, 2

@@ -17,12 +17,12 @@ import torch
 from fake_task import PointMass
 from torch import Tensor
 
+from dora.agents.checkpoint import read_checkpoint
 from dora.agents.collecting.rollouts import Rollouts
+from dora.agents.config import PPOConfig, RunConfig, SACConfig
 from dora.agents.evaluation.play import evaluate_checkpoint, record
 from dora.agents.learners.networks import last_layer
 from dora.agents.learners.ppo import PPO
-from dora.agents.runs.checkpoint import read_checkpoint
-from dora.agents.runs.config import PPOConfig, RunConfig, SACConfig
 from dora.agents.runs.logging import TAGS
 from dora.agents.runs.run_folder import RunFolder
 from dora.agents.runs.trainer import Trainer

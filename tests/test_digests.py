@@ -10,7 +10,7 @@ import torch
 from dora.affordance.bundled_sets import data_folder, load_candidates
 from dora.affordance.candidates import hand_digest
 from dora.affordance.objects.catalogue import available_objects
-from dora.agents.runs.checkpoint import read_checkpoint
+from dora.agents.checkpoint import read_checkpoint
 from dora.digests import KEY, digest_of
 from dora.robot import load_robot
 from dora.tasks import make_task

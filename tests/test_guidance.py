@@ -10,11 +10,11 @@ import dora.tasks as tasks
 from dora.affordance.candidates import GraspCandidates
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector
-from dora.tasks.env.options import PARTS
 from dora.tasks.env.perturbations import SENSOR_DRAWS, Disturbances, uniform
 from dora.tasks.guidance.candidate_choice import Choice
 from dora.tasks.guidance.grasp_and_lift import DESCEND, STANDOFF, GraspReference
 from dora.tasks.guidance.residual_action import SMOOTHING, Bounds, Correction, Target
+from dora.tasks.mdp.guidance_parts import PARTS
 from dora.tasks.mdp.randomisation import PRESETS, Preset
 
 CPU = torch.device("cpu")

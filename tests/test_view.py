@@ -23,11 +23,11 @@ from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand.hand_mesh import HandMesh, joined
 from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.objects.catalogue import available_objects, load_object
+from dora.affordance.objects.palette import PALETTE
 from dora.affordance.views import album, pictures
 from dora.affordance.views import page as viewing
 from dora.affordance.views.album import chosen
 from dora.affordance.views.page import CONTACTS, VALID, Filter, GraspPage, Surface, describe
-from dora.affordance.views.palette import PALETTE
 from dora.affordance.views.pictures import PARTS, TILE, best_view
 from dora.affordance.views.rasteriser import Camera, seen
 from dora.errors import InputError

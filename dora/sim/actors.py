@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Actor, Pose
 from sapien import physx
 
 from dora.affordance.objects.affordance_object import AffordanceObject
-from dora.affordance.views.palette import PALETTE, colours
+from dora.affordance.objects.palette import PALETTE, colours
 from dora.errors import InputError
 from dora.sim.shapes import collision_shape
 

@@ -9,7 +9,7 @@ from dora.errors import InputError
 from dora.tasks import cube as cube
 from dora.tasks import jug as jug
 from dora.tasks.env.base import DoraEnv
-from dora.tasks.hammer import env as hammer
+from dora.tasks.hammer import env as _hammer  # noqa: F401
 
 
 def task_ids() -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dora.errors import InputError
-from dora.sim.rendering import can_render
+from dora.sim.batch.rendering import can_render
 from dora.tasks import make_task, task_ids
 from dora.tools.task_pages import short_name
 

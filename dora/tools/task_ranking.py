@@ -1,7 +1,7 @@
 """Rank candidates by executing them in their task: whole episodes of the scripted solution, randomised and judged.
 
-What a simulated hand without an arm holds (`dora.sim.grasp_tests.shake_test`) an arm cannot always reach, and what it reaches it
-does not always lift without pressing too deep. The task itself is the last judge.
+What a simulated hand without an arm holds (`dora.sim.grasp_tests.shake_test`) an arm cannot always reach, and what it
+reaches it does not always lift without pressing too deep. The task itself is the last judge.
 """
 
 import math

@@ -4,34 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
-from trimesh.visual import ColorVisuals
 
 from dora.affordance.maps.nearest_points import NearestTable, RegionField
 from dora.affordance.maps.poisson_disk import sample_evenly
 from dora.affordance.objects.affordance_object import AffordanceObject
-from dora.affordance.views.palette import PALETTE, colours, legend_of
-from dora.affordance.views.rasteriser import Camera, render
-from dora.affordance.views.sheet import Panel, write_sheet
 from dora.errors import InputError
-from dora.files import read_tensors, write_bytes, write_tensors
+from dora.files import read_tensors, write_tensors
 
 COUNT = 4096
 """Surface points of a map."""
 FORMAT = "dora-map 1"
 """Format and version of a file of a map."""
-VIEWS = ((-1.0, 0.35), (2.4, 0.35))
-"""Azimuth and elevation (rad) of the pictures."""
-PLAIN = (225, 225, 225, 255)
-"""Colour of the surface under the points."""
-DISC_CORNERS, DISC_SHARE, DISC_LIFT = 8, 0.85, 2e-4
-"""Corners of a point's disc, its radius as a share of that with its area, and its distance (m) from the surface."""
 CANDIDATES_PER_NEIGHBOUR, FEWEST_CANDIDATES = 6, 48
 """Points that a cell of the table knows: this many per neighbour asked for, and at least the second."""
 
@@ -166,54 +155,6 @@ class AffordanceMap:
             "face_labels": torch.tensor(self.face_labels),
         }
         write_tensors(Path(path), FORMAT, self._tensors() | surface, metadata)
-
-    def painted(self) -> trimesh.Trimesh:
-        """The surface with each face in the colour of its region (object frame, m)."""
-        rgba = colours(self.face_labels, PALETTE)
-        return trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, face_colors=rgba, process=False)
-
-    def discs(self) -> trimesh.Trimesh:
-        """Every point as a disc as large as the area for which it stands, in the colour of its region."""
-        angle = torch.linspace(0, 2 * torch.pi, DISC_CORNERS + 1)[:-1]
-        first = torch.linalg.cross(self.normals, torch.eye(3)[self.normals.abs().argmin(1)])
-        first = torch.nn.functional.normalize(first, dim=-1)
-        second = torch.linalg.cross(self.normals, first)
-        radius = (self.areas / torch.pi).sqrt()[:, None, None]
-        ring = angle.cos()[:, None] * first[:, None] + angle.sin()[:, None] * second[:, None]
-        corners = (self.points + DISC_LIFT * self.normals)[:, None] + DISC_SHARE * radius * ring
-        fan = torch.tensor([[0, i, i + 1] for i in range(1, DISC_CORNERS - 1)])
-        faces = fan + DISC_CORNERS * torch.arange(len(self))[:, None, None]
-        colors = np.repeat(colours(self.labels.numpy(), PALETTE), len(fan), axis=0)
-        vertices = corners.reshape(-1, 3).numpy()
-        return trimesh.Trimesh(vertices, faces.reshape(-1, 3).numpy(), face_colors=colors, process=False)
-
-    def picture(self, path: Path | str, size: int = 400) -> None:
-        """Write a PNG: the painted surface from the front and from behind, and the points as discs on it.
-
-        Args:
-            path: of the file.
-            size: side of each of the three views (pixels).
-
-        Raises:
-            InputError: the file cannot be written.
-        """
-        own = self.to("cpu")
-        plain = trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False)
-        plain.visual = ColorVisuals(plain, face_colors=PLAIN)
-        shown = {
-            "regions, from the front": ([own.painted()], VIEWS[0]),
-            "from behind": ([own.painted()], VIEWS[1]),
-            f"the {len(self)} points of the map": ([plain, own.discs()], VIEWS[0]),
-        }
-        panels = [
-            Panel(render(meshes, Camera.around([self.mesh], *view), size, size), title)
-            for title, (meshes, view) in shown.items()
-        ]
-        write_sheet(panels, path, len(panels), legend_of(self.names), self.name)
-
-    def export_glb(self, path: Path | str) -> None:
-        """Write the painted surface as binary glTF (m), which every 3D viewer shows; raises InputError as `save`."""
-        write_bytes(Path(path), cast(bytes, trimesh.Scene(self.painted()).export(file_type="glb")))
 
     @classmethod
     def load(cls, path: Path | str, obj: AffordanceObject | None = None) -> AffordanceMap:

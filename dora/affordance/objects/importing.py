@@ -40,8 +40,8 @@ def import_object(
 
     Args:
         path: OBJ, STL, PLY, GLB, OFF or another format of trimesh. Several bodies are united.
-        labels: see `dora.affordance.objects.labels.read_labels`; if None, the parts are the named bodies of the file, else
-            its materials, else the whole.
+        labels: see `dora.affordance.objects.labels.read_labels`; if None, the parts are the named bodies of the file,
+            else its materials, else the whole.
         scale: factor of all lengths.
         units: of the file, one of `UNITS`; glTF files are in m.
         mass: kg; that of wood if None.

@@ -9,6 +9,7 @@ from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.search.cache import map_of
+from dora.affordance.views.map_pictures import picture_map
 from dora.affordance.views.page import Surface
 from dora.affordance.views.pictures import caption, picture_contacts, picture_grasps, picture_objects
 from dora.errors import InputError
@@ -38,7 +39,7 @@ def write_album(
     """
     _make(folder)
     paths = [folder / f"{obj.name}-{what}.png" for what in ("map", "grasps", "contacts")]
-    map_of(obj, "cpu").picture(paths[0])
+    picture_map(map_of(obj, "cpu"), paths[0])
     if candidates is None:
         return paths[:1]
     shown = candidates.select(chosen(candidates))

@@ -17,7 +17,7 @@ from dora.affordance.hand.hand_mesh import GAMMA, HandMesh, face_colours
 from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.maps.contact_semantic_map import contact_semantic_map
 from dora.affordance.objects.affordance_object import AffordanceObject
-from dora.affordance.views.palette import PALETTE, colours
+from dora.affordance.objects.palette import PALETTE, colours
 from dora.affordance.views.pictures import PARTS
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_matrix

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Int
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand.hand_mesh import HandMesh
 from dora.affordance.objects.affordance_object import AffordanceObject
-from dora.affordance.views.palette import PALETTE, colours, legend_of
+from dora.affordance.objects.palette import PALETTE, colours, legend_of
 from dora.affordance.views.rasteriser import Camera, render, seen
 from dora.affordance.views.sheet import Panel, write_sheet
 from dora.robot import RobotDescription

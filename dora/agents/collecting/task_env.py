@@ -74,6 +74,8 @@ class Task(Protocol):
 
 TaskFactory = Callable[[], Task]
 """Makes a task; must be picklable, because worker processes call it."""
+MakeTask = Callable[[int], Task]
+"""Makes a task with the given number of environments; picklable."""
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from dora.agents.collecting.rollouts import sigint_blocked
 from dora.agents.collecting.task_env import TaskEnv, TaskFactory
+from dora.agents.config import RunConfig
 from dora.agents.evaluation.evaluate import FINAL_SEED, Act, Evaluation, no_correction, run_batch
 from dora.agents.learners.learner import make_learner
 from dora.agents.learners.networks import Policy
-from dora.agents.runs.config import RunConfig
 from dora.errors import InputError
 
 POLL_SECONDS = 0.2

@@ -11,14 +11,13 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from dora.agents.collecting.task_env import Task
+from dora.agents.checkpoint import Checkpoint, check_belongs, read_checkpoint, unpack_modules
+from dora.agents.collecting.task_env import MakeTask, Task
+from dora.agents.config import RunConfig
 from dora.agents.evaluation.evaluate import FINAL_SEED, Act, Evaluation
 from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.learner import make_learner
 from dora.agents.learners.networks import Policy
-from dora.agents.runs.checkpoint import Checkpoint, check_belongs, read_checkpoint, unpack_modules
-from dora.agents.runs.config import RunConfig
-from dora.agents.runs.trainer import MakeTask
 
 FRAMES_PER_SECOND = 20  # of a film, if the task does not say its control frequency
 

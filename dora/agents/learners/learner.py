@@ -6,11 +6,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
+from dora.agents.config import PPOConfig, RunConfig
 from dora.agents.learners.networks import Policy
 from dora.agents.learners.ppo import PPO
 from dora.agents.learners.replay import Replay
 from dora.agents.learners.sac import SAC
-from dora.agents.runs.config import PPOConfig, RunConfig
 
 
 @runtime_checkable

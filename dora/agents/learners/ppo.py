@@ -9,8 +9,8 @@ from torchrl.modules import IndependentNormal
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
+from dora.agents.config import PPOConfig
 from dora.agents.learners.networks import Critic, GaussianActor, Normaliser, Policy, for_loss
-from dora.agents.runs.config import PPOConfig
 
 ADAM_EPSILON = 1e-8  # far below the gradients of values that are mean rewards
 LEARNING_RATE_DOWN, LEARNING_RATE_UP = 1.3, 1.2  # factors of the adaptation

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
+from dora.agents.config import SACConfig
 from dora.agents.learners.networks import Critic, Normaliser, Policy, TanhActor, for_loss
 from dora.agents.learners.replay import Replay
-from dora.agents.runs.config import SACConfig
 
 ACTOR_PERIOD = 2  # gradient steps of the critics per step of actor and temperature
 

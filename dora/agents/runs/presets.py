@@ -4,7 +4,7 @@ import dataclasses
 import os
 from typing import Any
 
-from dora.agents.runs.config import GUIDANCES, LEARNER_CONFIGS, SINGLE_ARM_AGENTS, RunConfig
+from dora.agents.config import GUIDANCES, LEARNER_CONFIGS, SINGLE_ARM_AGENTS, RunConfig
 from dora.errors import InputError
 
 DEFAULT_AGENT = "ppo"

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from dora.agents.runs.config import RunConfig, config_from_dict
+from dora.agents.config import RunConfig, config_from_dict
 from dora.agents.evaluation.evaluate import Evaluation
 from dora.errors import InputError
 from dora.files import write_bytes, write_csv, write_json

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dora.agents.runs.checkpoint import (
+from dora.agents.checkpoint import (
     Checkpoint,
     check_belongs,
     pack_modules,
@@ -23,8 +23,8 @@ from dora.agents.runs.checkpoint import (
     unpack_rng,
 )
 from dora.agents.collecting.rollouts import Rollouts
-from dora.agents.runs.config import RunConfig
-from dora.agents.collecting.task_env import EpisodeColumns, Task, ended_episodes
+from dora.agents.config import RunConfig
+from dora.agents.collecting.task_env import MakeTask, EpisodeColumns, Task, ended_episodes
 from dora.agents.evaluation.evaluate import PERIODIC_SEED, Evaluation, outcome
 from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.runs.interrupt import Interrupt
@@ -35,9 +35,6 @@ from dora.agents.runs.run_folder import RunFolder, make_result
 
 TRAINING_SEEDS = 1_000_000_000  # seeds of training are below, those of evaluation above
 RECENT = 200  # training episodes over which the shown success rate is taken
-
-MakeTask = Callable[[int], Task]
-"""Makes a task with the given number of environments; picklable."""
 
 
 def seeds_for(seed: int, step: int, count: int) -> list[int]:

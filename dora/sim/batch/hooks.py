@@ -23,8 +23,8 @@ from sapien import physx
 
 from dora.errors import InputError
 from dora.sim.batch.actions import check_action
+from dora.sim.batch.rendering import can_render
 from dora.sim.batch.scene import BatchScene
-from dora.sim.rendering import can_render
 
 BACKEND = "physx_cpu_batch"
 SUPPORTED = {"mani_skill": "3.0.1", "sapien": "3.0.3"}

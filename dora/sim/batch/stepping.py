@@ -8,8 +8,8 @@ import numpy as np
 import sapien
 
 from dora.sim.batch.packed import PackedSource
+from dora.sim.batch.profile import StepProfile
 from dora.sim.batch.queries import ContactImpulses, ContactScanner
-from dora.sim.profile import StepProfile
 
 Setters = Sequence[Callable[[float], None]]
 

@@ -16,9 +16,9 @@ from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector
 from dora.sim.batch.actions import check_action
 from dora.tasks.env.building import SCALE_DRAW, BuiltEnv
-from dora.tasks.env.options import FILTER
 from dora.tasks.guidance.candidate_choice import ERROR_DRAWS
 from dora.tasks.guidance.residual_action import Target, wrist_step
+from dora.tasks.mdp.guidance_parts import FILTER
 from dora.tasks.mdp.snapshot import Snapshot, advanced, lifted
 
 TRIES = 8

@@ -22,7 +22,7 @@ from dora.sim.properties import ObjectProperties
 from dora.sim.robot_agent import DescribedRobot
 from dora.tasks.env.episode_memory import Episode
 from dora.tasks.env.judging import JudgedEnv
-from dora.tasks.env.options import PRIOR, check_options
+from dora.tasks.env.options import check_options
 from dora.tasks.env.perturbations import Disturbances
 from dora.tasks.env.state_reader import SimulatorReader
 from dora.tasks.env.table import add_table
@@ -30,6 +30,7 @@ from dora.tasks.guidance.candidate_choice import Choice
 from dora.tasks.guidance.grasp_and_lift import GraspReference, Guide
 from dora.tasks.guidance.reference import Reference
 from dora.tasks.guidance.residual_action import Bounds, Correction
+from dora.tasks.mdp.guidance_parts import PRIOR
 
 SCALE_DRAW = 256
 """Which number of an environment's stream is its size: episodes begin with the same numbers, and use fewer."""

@@ -9,8 +9,8 @@ from mani_skill.envs.sapien_env import BaseEnv
 from torch import Tensor
 
 from dora.tasks.env.episode_memory import Episode
-from dora.tasks.env.options import FILTER, REWARD
 from dora.tasks.guidance.grasp_and_lift import Guide
+from dora.tasks.mdp.guidance_parts import FILTER, REWARD
 from dora.tasks.mdp.observations import OBSERVATIONS, Entry
 from dora.tasks.mdp.rewards import Terms
 from dora.tasks.mdp.snapshot import Snapshot

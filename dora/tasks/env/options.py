@@ -9,14 +9,10 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 
 from dora.errors import InputError
 from dora.robot import available_robots
-from dora.sim.rendering import can_render
+from dora.sim.batch.rendering import can_render
 from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot, register_robot
+from dora.tasks.mdp.guidance_parts import guidance_in_force
 from dora.tasks.mdp.randomisation import Preset, find_preset
-
-GUIDANCE = ("affordance", "none")
-OBSERVATION, REWARD, FILTER, PRIOR = PARTS = ("observation", "reward", "filter", "prior")
-"""The parts of guidance: features in the observation, terms of the reward, choice among reachable candidates only,
-and the reference that the action corrects."""
 
 
 def choose_render_backend(render_mode: str | None, obs_mode: str | None) -> str:
@@ -45,26 +41,6 @@ class TaskOptions:
     control_mode: str
     sim_backend: str
     render_backend: str
-
-
-def guidance_in_force(guidance: str, parts: Sequence[str] | None) -> frozenset[str]:
-    """The parts of guidance that a task has: all of them, or those that are named; none with `guidance="none"`.
-
-    Raises:
-        InputError: for an unknown guidance or part, or parts of no guidance.
-    """
-    if guidance not in GUIDANCE:
-        raise InputError(f"unknown guidance {guidance!r}; choose one of {', '.join(GUIDANCE)}")
-    if guidance == "none":
-        if parts:
-            raise InputError('guidance="none" has no parts; leave guidance_parts out, or choose guidance="affordance"')
-        return frozenset()
-    if parts is None:
-        return frozenset(PARTS)
-    named = (parts,) if isinstance(parts, str) else tuple(parts)
-    if unknown := set(named) - set(PARTS):
-        raise InputError(f"unknown guidance part {sorted(unknown)[0]!r}; choose among {', '.join(PARTS)}")
-    return frozenset(named)
 
 
 def check_options(

@@ -161,7 +161,7 @@ class Guide:
     """The parts of guidance that a task has in force, and what they work with.
 
     Args:
-        parts: which of `dora.tasks.env.options.PARTS`.
+        parts: which of `dora.tasks.mdp.guidance_parts.PARTS`.
         choice: the candidates in use.
         reference: leads the hand.
         correction: what the action does to the reference.

@@ -13,7 +13,7 @@ from dora.geometry.rotations import (
     quaternion_inverse,
     quaternion_multiply,
 )
-from dora.tasks.env.options import OBSERVATION, PRIOR
+from dora.tasks.mdp.guidance_parts import OBSERVATION, PRIOR
 from dora.tasks.mdp.snapshot import Snapshot, goal_error, in_wrist, lifted, near_errors, turned_in_wrist
 
 FASTEST_SPIN = 30.0

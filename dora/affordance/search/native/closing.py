@@ -1,7 +1,7 @@
 """The closing hand in compiled loops: one step of descent towards equilibrium, and the sequence of closing and loading.
 
-`dora.affordance.search.quasi_static_closing` says what is modelled. What moves is the wrist in the object frame: the object seen from the
-hand.
+`dora.affordance.search.quasi_static_closing` says what is modelled. What moves is the wrist in the object frame: the
+object seen from the hand.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The grasp energy: the same values and gradients as `dora.affordance.search.energies.GraspEnergy`, which defines them."""
+"""The grasp energy: values and gradients of `dora.affordance.search.energies.GraspEnergy`, which defines them."""
 
 import math
 from typing import NamedTuple
@@ -31,7 +31,7 @@ class _Room(NamedTuple):
 
 
 class Adam(NamedTuple):
-    """As `dora.affordance.search.descent`: largest steps (6 + a,), their shares (n,), steps taken before, decays, smallest."""
+    """As in `..search.descent`: largest steps (6 + a,), their shares (n,), steps taken before, decays, smallest."""
 
     largest: np.ndarray
     size: np.ndarray

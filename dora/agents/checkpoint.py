@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from dora.agents.runs.config import RunConfig, config_from_dict
+from dora.agents.config import RunConfig, config_from_dict
 from dora.errors import InputError
 from dora.files import write_bytes
 

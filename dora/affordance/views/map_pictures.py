@@ -1,0 +1,75 @@
+"""Pictures and 3D files of affordance maps."""
+
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+import trimesh
+from trimesh.visual import ColorVisuals
+
+from dora.affordance.maps.affordance_map import AffordanceMap
+from dora.affordance.objects.palette import PALETTE, colours, legend_of
+from dora.affordance.views.rasteriser import Camera, render
+from dora.affordance.views.sheet import Panel, write_sheet
+from dora.files import write_bytes
+
+VIEWS = ((-1.0, 0.35), (2.4, 0.35))
+"""Azimuth and elevation (rad) of the pictures."""
+PLAIN = (225, 225, 225, 255)
+"""Colour of the surface under the points."""
+DISC_CORNERS, DISC_SHARE, DISC_LIFT = 8, 0.85, 2e-4
+"""Corners of a point's disc, its radius as a share of that with its area, and its distance (m) from the surface."""
+
+
+def painted(map: AffordanceMap) -> trimesh.Trimesh:
+    """The surface with each face in the colour of its region (object frame, m)."""
+    rgba = colours(map.face_labels, PALETTE)
+    return trimesh.Trimesh(map.mesh.vertices, map.mesh.faces, face_colors=rgba, process=False)
+
+
+def discs(map: AffordanceMap) -> trimesh.Trimesh:
+    """Every point as a disc as large as the area for which it stands, in the colour of its region."""
+    angle = torch.linspace(0, 2 * torch.pi, DISC_CORNERS + 1)[:-1]
+    first = torch.linalg.cross(map.normals, torch.eye(3)[map.normals.abs().argmin(1)])
+    first = torch.nn.functional.normalize(first, dim=-1)
+    second = torch.linalg.cross(map.normals, first)
+    radius = (map.areas / torch.pi).sqrt()[:, None, None]
+    ring = angle.cos()[:, None] * first[:, None] + angle.sin()[:, None] * second[:, None]
+    corners = (map.points + DISC_LIFT * map.normals)[:, None] + DISC_SHARE * radius * ring
+    fan = torch.tensor([[0, i, i + 1] for i in range(1, DISC_CORNERS - 1)])
+    faces = fan + DISC_CORNERS * torch.arange(len(map))[:, None, None]
+    colors = np.repeat(colours(map.labels.numpy(), PALETTE), len(fan), axis=0)
+    vertices = corners.reshape(-1, 3).numpy()
+    return trimesh.Trimesh(vertices, faces.reshape(-1, 3).numpy(), face_colors=colors, process=False)
+
+
+def picture_map(map: AffordanceMap, path: Path | str, size: int = 400) -> None:
+    """Write a PNG: the painted surface from the front and from behind, and the points as discs on it.
+
+    Args:
+        map: what to draw.
+        path: of the file.
+        size: side of each of the three views (pixels).
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    own = map.to("cpu")
+    plain = trimesh.Trimesh(map.mesh.vertices, map.mesh.faces, process=False)
+    plain.visual = ColorVisuals(plain, face_colors=PLAIN)
+    shown = {
+        "regions, from the front": ([painted(own)], VIEWS[0]),
+        "from behind": ([painted(own)], VIEWS[1]),
+        f"the {len(map)} points of the map": ([plain, discs(own)], VIEWS[0]),
+    }
+    panels = [
+        Panel(render(meshes, Camera.around([map.mesh], *view), size, size), title)
+        for title, (meshes, view) in shown.items()
+    ]
+    write_sheet(panels, path, len(panels), legend_of(map.names), map.name)
+
+
+def export_glb(map: AffordanceMap, path: Path | str) -> None:
+    """Write the painted surface as binary glTF (m), which every 3D viewer shows; InputError if it cannot be written."""
+    write_bytes(Path(path), cast(bytes, trimesh.Scene(painted(map)).export(file_type="glb")))

@@ -1,0 +1,1 @@
+"""The bodies of the commands: what `experiments/*.py` call. Stands above everything."""

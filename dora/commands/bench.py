@@ -1,0 +1,101 @@
+"""Measure how fast the parts of Dora are: python experiments/bench.py env --env PickCube-v1 --json"""
+
+import dataclasses
+import json
+import sys
+
+import tyro
+
+from dora.errors import InputError
+from dora.progress import PhaseProgress
+from dora.robot import load_robot
+from dora.tools import env_benchmark as benchmark
+from dora.tools import grasp_benchmark
+from dora.tools import physics_benchmark as task_physics
+
+app = tyro.extras.SubcommandApp()
+
+
+@app.command(name="env")
+def bench_env(
+    env: str = "PickCube-v1",
+    num_envs: int = 256,
+    workers: int = benchmark.all_cores(),
+    seconds: float = 10.0,
+    json: bool = False,
+) -> None:
+    """Environment steps per second with random actions, against an AsyncVectorEnv of single environments.
+
+    Args:
+        env: task, any ManiSkill id.
+        num_envs: environments in each process.
+        workers: processes (default: one per core).
+        seconds: length of each of the four measurements [s].
+        json: print one JSON object on the last line instead of a table.
+    """
+    report(dataclasses.asdict(benchmark.measure(env, num_envs, workers, seconds)), json)
+
+
+@app.command(name="grasp")
+def bench_grasp(object: str = "cube", robot: str = "diana7_hit", json: bool = False) -> None:
+    """Grasp candidates per second on one core, against plain pytorch_kinematics and trimesh.
+
+    Args:
+        object: cube, jug, hammer or microwave.
+        robot: folder of the robot.
+        json: print one JSON object on the last line instead of a table.
+    """
+    report(dataclasses.asdict(grasp_benchmark.measure(object, load_robot(robot))), json)
+
+
+PHYSICS = ("120:10:8", "240:2:8", "240:3:6", "240:5:4", "240:5:8", "240:10:4", "240:10:8", "240:10:15", "480:10:8")
+
+
+@app.command(name="physics")
+def bench_physics(
+    env: str = "DoraHammer-v1",
+    settings: tuple[str, ...] = PHYSICS,
+    starts: int = 64,
+    preset: str = "none",
+    json: bool = False,
+) -> None:
+    """What a task's scripted solution makes of other physics settings: success, overlaps, tunnelling, time.
+
+    Args:
+        env: a Dora id.
+        settings: FREQUENCY:OFFSET:ITERATIONS each, in Hz, mm, and position iterations of the solver.
+        starts: initial states, the same for all settings.
+        preset: how much they are randomised.
+        json: print one JSON object on the last line instead of a table.
+    """
+    asked = [task_physics.parse_physics(text) for text in settings]
+    with PhaseProgress() as progress:
+        update = progress.phase(f"physics of {env}", "settings")
+        rows = task_physics.measure_physics(env, asked, starts, preset, progress=update)
+    flat = [dataclasses.asdict(row.physics) | dataclasses.asdict(row) for row in rows]
+    flat = [{k: v for k, v in row.items() if k != "physics"} for row in flat]
+    if json:
+        report({"env": env, "starts": starts, "preset": preset, "rows": flat}, True)
+        return
+    print("".join(f"{name:>20}" for name in flat[0]))
+    for row in flat:
+        print("".join(f"{value:20.4g}" for value in row.values()))
+
+
+def report(result: dict, as_json: bool) -> None:
+    """Print a result as a table or as one line of JSON."""
+    if as_json:
+        print(json.dumps(result))
+    else:
+        for name, value in result.items():
+            print(f"{name:32} {value}")
+
+
+def main() -> int:
+    """Run the command; returns the exit status."""
+    try:
+        app.cli(description=__doc__)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0

@@ -1,0 +1,146 @@
+"""Generate grasps of an object, judge them, and store them.
+
+    python experiments/grasps.py --object jug --num 256 --validate sapien --out runs/jug.safetensors
+    python experiments/grasps.py --mesh mug.glb --labels mug.yaml --units mm --region handle
+
+Prints a table with baselines beside it (searches without E_DFC, without closing the hand around the object, and of one
+iteration), and writes OUT (safetensors) and a .json beside it. `experiments/view.py OUT` shows the grasps.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.objects.importing import import_object
+from dora.errors import InputError
+from dora.progress import PhaseProgress
+from dora.robot import load_robot
+from dora.sim.grasp_tests.bundle_maker import ship
+from dora.sim.grasp_tests.generation import baselines, by_region, generate, summary, voting_summary
+from dora.sim.grasp_tests.report import check_out, print_report, write_report
+from dora.tools.task_ranking import TASKS, prove_shipped, usable_in_task
+
+INTERRUPTED = 130  # exit status after Ctrl-C
+BAD_INPUT = 2  # exit status after input that a person can mend
+ANY = "any"  # value of --region for a free search
+
+
+@dataclass
+class Args:
+    """Generate grasps of one of our objects (--object) or of a mesh (--mesh)."""
+
+    object: Literal["cube", "jug", "hammer", "microwave"] | None = None
+    """One of our objects; "microwave" is the handle of a microwave's door."""
+    mesh: Path | None = None
+    """Your own mesh: OBJ, STL, PLY or GLB, closed or nearly so."""
+    labels: Path | None = None
+    """Regions of --mesh: a file with one label per face, or a YAML of boxes and planes (docs/objects.md)."""
+    num: int = 256
+    """Candidates to search for."""
+    seed: int = 0
+    """Seed of all random draws."""
+    region: str | None = None
+    """Region to hold, or "any" (default: what the task wants of our objects, any of a mesh)."""
+    scale: float = 1.0
+    """Factor of all lengths of --mesh."""
+    units: Literal["m", "cm", "mm", "in"] = "m"
+    """Unit of length of --mesh; GLB files are in metres."""
+    robot: str = "diana7_hit"
+    """Robot whose hand grasps: a folder name in robots/ or a path."""
+    out: Path | None = None
+    """File to write (default runs/grasps/<object>.safetensors); the report goes beside it as .json."""
+    validate: Literal["none", "sapien"] = "none"
+    """Close the hand and pull along six directions in SAPIEN, or only measure penetration."""
+    baselines: int = 64
+    """Candidates of each baseline; 0 leaves the baselines out."""
+    by_region: int = 0
+    """Candidates of a search for each other region and of a free one, simulated as well: how often each region is held
+    with and without asking for it, and how well the vote tells (needs --validate sapien)."""
+    ship: bool = False
+    """Make the set that comes with Dora for --object instead: enough valid grasps, ranked by simulated lifts; then
+    what --prove does, where the object has a task with a table."""
+    prove: bool = False
+    """Execute the set that comes with Dora for --object in its task, and rank it by the episodes that succeed."""
+
+
+def target(args: Args) -> tuple[AffordanceObject, str | None]:
+    """The object, and the region to hold (None: any)."""
+    if (args.object is None) == (args.mesh is None):
+        raise InputError("Give either --object or --mesh, for example --object jug.")
+    if args.num < 1 or args.baselines < 0:
+        raise InputError(f"--num is {args.num} and --baselines {args.baselines}: at least 1 and 0 are needed.")
+    if args.by_region < 0 or (args.by_region and args.validate == "none"):
+        raise InputError(f"--by-region is {args.by_region}: give a positive number, and --validate sapien with it.")
+    if args.object is not None:
+        if args.labels is not None or args.scale != 1 or args.units != "m":
+            raise InputError("--labels, --scale and --units belong to --mesh: leave them out with --object.")
+        obj = load_object(args.object)
+        return obj, region_of(obj, args.region or obj.target)
+    assert args.mesh is not None
+    obj = import_object(args.mesh, labels=args.labels, scale=args.scale, units=args.units)
+    return obj, region_of(obj, args.region or ANY)
+
+
+def region_of(obj: AffordanceObject, region: str) -> str | None:
+    """A region that the object has; None for any."""
+    if region == ANY:
+        return None
+    obj.label_index(region)
+    return region
+
+
+def run(args: Args) -> None:
+    """Generate, print and write."""
+    obj, region = target(args)
+    robot = load_robot(args.robot)
+    out = args.out or Path("runs") / "grasps" / f"{obj.name}.safetensors"
+    check_out(out)
+    simulate = args.validate == "sapien"
+    with PhaseProgress() as phases:
+        generated = generate(obj, robot, args.num, args.seed, region, phases, simulate)
+        report = summary(generated)
+        searches = {}
+        if args.by_region:
+            searches = by_region(obj, robot, args.by_region, args.seed, region, phases)
+            report["by_region"] = {name: summary(found) for name, found in searches.items()}
+        if simulate:
+            report["voting"] = voting_summary([generated, *searches.values()], obj)
+        if args.baselines:
+            report["baselines"] = baselines(obj, robot, args.baselines, args.seed, region, phases, simulate)
+    print_report(report)
+    write_report(report, generated.candidates, out)
+    print(out)
+
+
+def remake(args: Args) -> None:
+    """Make or prove the shipped set of an object."""
+    name = args.object or ""
+    if not args.ship and name not in TASKS:
+        raise InputError(f"--prove needs --object, one of {', '.join(TASKS)}: no task proves {name!r}.")
+    with PhaseProgress() as phases:
+        if args.ship:
+            print(ship(name, args.seed, phases, usable_in_task(name)))
+        if name in TASKS:
+            print(prove_shipped(name, lambda title: phases.phase(title, "episodes")))
+
+
+def main() -> int:
+    """Run the command; returns the exit status."""
+    args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
+    try:
+        if args.ship or args.prove:
+            remake(args)
+        else:
+            run(args)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("Interrupted; nothing was written.", file=sys.stderr)
+        return INTERRUPTED
+    return 0
