@@ -12,7 +12,7 @@ SIZES = {
     "touch": 6, "force": 6, "action": 26, "previous_action": 26, "correction": 26,
     "goal_pregrasp": 20, "goal_grasp": 20, "contact_finger": 0,
 }  # fmt: skip
-SCALARS = ("supported", "penetration", "deepest", "stage", "time")
+SCALARS = ("supported", "penetration", "max_penetration", "stage", "time")
 
 
 def zeros(kind: type[Snapshot], n: int, phases: int = 4, scalars: tuple[str, ...] = ()) -> dict[str, Tensor]:

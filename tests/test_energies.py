@@ -48,7 +48,7 @@ def draw(hand: HandModel, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, to
     generator = torch.Generator().manual_seed(seed)
     wrist = torch.eye(4, dtype=DOUBLE).repeat(COUNT, 1, 1)
     turn = matrix_from_rotation_vector(2 * torch.randn(COUNT, 3, generator=generator, dtype=DOUBLE))
-    center = torch.tensor(hand.grip.center + 0.04 * hand.grip.normal)
+    center = torch.tensor(hand.palm_frame.center + 0.04 * hand.palm_frame.normal)
     wrist[:, :3, :3] = turn
     wrist[:, :3, 3] = 0.03 * torch.randn(COUNT, 3, generator=generator, dtype=DOUBLE) - turn @ center
     share = 1.1 * torch.rand(COUNT, len(hand.lower), generator=generator, dtype=DOUBLE) - 0.05

@@ -11,7 +11,7 @@ import pytest
 import torch
 from commands import call, load_command
 
-from dora.affordance.bundled_sets import shipped_path
+from dora.affordance.bundled_sets import bundled_path
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand.protocol import STANDARD
 from dora.affordance.objects.catalogue import load_object
@@ -170,7 +170,7 @@ def test_searches_by_region_and_the_votes(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ):
     """12 grasps by the handle asked for, and as many of a free search, of the body's and of the rim's."""
-    shipped = GraspCandidates.load(shipped_path("jug"))
+    shipped = GraspCandidates.load(bundled_path("jug"))
     asked = []
 
     def search(obj, robot, num, seed, region, settings, progress) -> GraspCandidates:
@@ -201,7 +201,7 @@ def test_searches_by_region_and_the_votes(
 
 
 def test_the_digest_follows_object_robot_and_settings():
-    path = shipped_path("cube")
+    path = bundled_path("cube")
     candidates = GraspCandidates.load(path)
     digest = grasps.origin_digest(candidates)
     assert grasps.origin_digest(GraspCandidates.load(path)) == digest

@@ -10,12 +10,12 @@ import dora.tasks as tasks
 from dora.affordance.candidates import GraspCandidates
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector
-from dora.tasks.env.perturbations import SENSOR_DRAWS, Disturbances, uniform
+from dora.tasks.env.perturbations import SENSOR_DRAWS, Perturbations, uniform
 from dora.tasks.guidance.candidate_choice import Choice
 from dora.tasks.guidance.grasp_and_lift import DESCEND, STANDOFF, GraspReference
-from dora.tasks.guidance.residual_action import SMOOTHING, Bounds, Correction, Target
+from dora.tasks.guidance.residual_action import SMOOTHING, Bounds, ResidualAction, Target
 from dora.tasks.mdp.guidance_parts import PARTS
-from dora.tasks.mdp.randomisation import PRESETS, Preset
+from dora.tasks.mdp.randomisation import PRESETS, Randomisation
 
 CPU = torch.device("cpu")
 IDENTITY = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
@@ -74,7 +74,7 @@ def test_candidate_errors_are_bounded_and_follow_the_share():
 
 def test_corrections_are_low_passed_bounded_and_in_the_hand_frame():
     bounds = Bounds(position=0.02, rotation=0.1, joint=0.2)
-    correction = Correction(1, 26, bounds, CPU)
+    correction = ResidualAction(1, 26, bounds, CPU)
     quarter = torch.tensor([[0.5**0.5, 0.0, 0.0, 0.5**0.5]])  # hand x is world y
     target = Target(torch.zeros(1, 3), quarter, torch.zeros(1, 20))
     action = torch.zeros(1, 26)
@@ -127,31 +127,31 @@ def test_noise_is_a_function_of_key_and_step_and_looks_uniform():
 
 def test_what_is_seen_is_noisy_within_the_preset_and_the_truth_is_kept():
     preset, n = PRESETS["standard"], 300
-    noise = Disturbances(preset, n, 26, 20, CPU)
+    noise = Perturbations(preset, n, 26, 20, CPU)
     noise.begin(torch.arange(n), torch.rand(n, generator=torch.Generator().manual_seed(0)))
     choice = Choice(along_x(0.1), n, CPU)
     s = invented(n)
-    seen = noise.seen(s, choice, torch.zeros(n, dtype=torch.long))
-    assert seen.object_p.abs().max() <= preset.seen_position
-    assert seen.object_p.std() > 0.4 * preset.seen_position
-    assert 0 < seen.hand_q.abs().max() <= preset.seen_joint
+    seen = noise.observed(s, choice, torch.zeros(n, dtype=torch.long))
+    assert seen.object_p.abs().max() <= preset.observed_position
+    assert seen.object_p.std() > 0.4 * preset.observed_position
+    assert 0 < seen.hand_q.abs().max() <= preset.observed_joint
     assert torch.equal(s.object_p, torch.zeros(n, 3))
     assert torch.equal(s.hand_q, torch.zeros(n, 20))
     torch.testing.assert_close(seen.goal_p, choice.goals(seen.object_p, seen.object_q)[0][:, 0])
     assert torch.equal(seen.touch, s.touch)
-    clear = Disturbances(PRESETS["none"], n, 26, 20, CPU)
-    assert clear.seen(s, choice, torch.zeros(n, dtype=torch.long)) is s
+    clear = Perturbations(PRESETS["none"], n, 26, 20, CPU)
+    assert clear.observed(s, choice, torch.zeros(n, dtype=torch.long)) is s
 
 
 def test_delayed_actions_take_effect_later_and_the_first_at_once():
-    late = Disturbances(Preset(name="late", delay=2), 1, 1, 20, CPU)
+    late = Perturbations(Randomisation(name="late", delay=2), 1, 1, 20, CPU)
     done = [late.delayed(torch.tensor([[float(k)]]), torch.tensor([k])).item() for k in range(6)]
     assert done == [0.0, 0.0, 0.0, 1.0, 2.0, 3.0]
 
 
 def test_pushes_come_at_their_rate_with_their_impulse_in_all_directions():
     preset, n, steps = PRESETS["hard"], 100, 200
-    pushes = Disturbances(preset, n, 26, 20, CPU)
+    pushes = Perturbations(preset, n, 26, 20, CPU)
     pushes.begin(torch.arange(n), torch.rand(n, generator=torch.Generator().manual_seed(1)))
     all_steps = torch.stack([pushes.pushes(torch.full((n,), k)) for k in range(steps)]).flatten(0, 1)
     hit = all_steps.norm(dim=-1) > 0

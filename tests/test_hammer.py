@@ -190,8 +190,10 @@ def test_depth_pays_until_the_target_and_only_if_driven():
     depth = torch.tensor([0.0, 0.005, 0.010, 0.020])
     driven = hammer.TERMS.terms["strike"].value(invented(4, nail_driven=depth, nail_depth=depth))
     torch.testing.assert_close(driven, torch.tensor([0.0, 0.5, 1.0, 1.0]))
-    spoiled = hammer.TERMS.terms["strike"].value(invented(4, nail_driven=depth, deepest=torch.full((4,), 0.006)))
-    torch.testing.assert_close(spoiled, AFTER_OVERLAP * driven)
+    overlapped = hammer.TERMS.terms["strike"].value(
+        invented(4, nail_driven=depth, max_penetration=torch.full((4,), 0.006))
+    )
+    torch.testing.assert_close(overlapped, AFTER_OVERLAP * driven)
     pushed = hammer.TERMS.terms["strike"].value(invented(4, nail_depth=depth))
     assert (pushed == 0).all()
 

@@ -106,14 +106,14 @@ def test_contact_points_are_on_the_surface_and_face_inwards(hand):
     poses = hand.forward(torch.eye(4, dtype=torch.float64)[None], closed)
     normal = (poses[0, hand.contacts.body, :3, :3] @ hand.contact_normal[..., None]).squeeze(-1)
     palm, fingers = hand.contact_part == PALM, hand.contact_part > PALM + 1
-    assert (normal[palm] @ torch.tensor(hand.grip.normal)).min() > 0.5
-    assert (normal[fingers] @ torch.tensor(hand.grip.normal)).mean() > 0.4
+    assert (normal[palm] @ torch.tensor(hand.palm_frame.normal)).min() > 0.5
+    assert (normal[fingers] @ torch.tensor(hand.palm_frame.normal)).mean() > 0.4
 
 
 def test_grip_frame_of_this_hand(hand):
-    assert hand.grip.normal @ [1, 0, 0] > 0.99
-    assert hand.grip.along @ [0, 0, 1] > 0.99
-    assert hand.grip.across @ [0, 1, 0] > 0.99
+    assert hand.palm_frame.normal @ [1, 0, 0] > 0.99
+    assert hand.palm_frame.along @ [0, 0, 1] > 0.99
+    assert hand.palm_frame.across @ [0, 1, 0] > 0.99
 
 
 def test_spheres_lie_in_the_capsules_and_cover_their_axes(hand):

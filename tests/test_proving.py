@@ -8,13 +8,13 @@ import torch
 from dora.affordance.bundled_sets import data_folder, load_candidates
 from dora.affordance.candidates import concatenate
 from dora.tasks import make_task
-from dora.tools.task_ranking import TASKS, Proof, _Balanced, prove, ranked
+from dora.tools.task_ranking import TASKS, TaskRanking, _Balanced, rank_in_task, ranked
 
 
 def test_a_proof_tells_a_good_grasp_from_one_in_the_air():
     good = load_candidates("cube").select([0])
     away = replace(good, position=good.position + torch.tensor([0.0, 0.0, 0.10]))
-    proof = prove("DoraCube-v1", concatenate([away, good]), 64, preset="none")
+    proof = rank_in_task("DoraCube-v1", concatenate([away, good]), 64, preset="none")
     assert proof.tries.sum() <= 64
     assert (proof.tries > 10).all()
     assert proof.score[1] > 0.8
@@ -46,7 +46,7 @@ def test_a_start_without_any_candidate_is_no_try():
 
 def test_among_equals_the_one_reached_more_often_is_first():
     two = load_candidates("cube").select([0, 1])
-    best_first = ranked(two, Proof(torch.tensor([3, 9]), torch.tensor([1.0, 1.0])))
+    best_first = ranked(two, TaskRanking(torch.tensor([3, 9]), torch.tensor([1.0, 1.0])))
     torch.testing.assert_close(best_first.position, two.position[[1, 0]])
 
 

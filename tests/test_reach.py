@@ -32,7 +32,7 @@ from dora.robot import SerialChain, load_robot
 from dora.robot.motion import controller_rollout as servo
 from dora.robot.motion import inverse_kinematics
 from dora.robot.motion.collision import CollisionModel
-from dora.robot.motion.height_bounds import ArmExtent, HandExtent
+from dora.robot.motion.height_bounds import ArmHeightBounds, HandHeightBounds
 from dora.robot.motion.inverse_kinematics import ANGLE_TOLERANCE, POSITION_TOLERANCE, InverseKinematics
 from dora.robot.motion.planning import densified
 from dora.sim import controllers
@@ -176,7 +176,7 @@ def test_a_start_posture_of_another_arm_is_refused(robot):
 def test_heights_are_where_coal_touches_the_table(robot, kinematics):
     """Lowest points of hand and arm by formula against Coal's plane, for random postures."""
     generator, up = np.random.default_rng(2), torch.tensor([0.0, 0.0, 1.0])
-    extents = HandExtent(robot), ArmExtent(robot, kinematics.chain)
+    extents = HandHeightBounds(robot), ArmHeightBounds(robot, kinematics.chain)
     for _ in range(12):
         arm = 0.5 * (generator.uniform(robot.arm.lower, robot.arm.upper) + robot.postures["home"].arm)
         hand = generator.uniform(robot.hand.lower, robot.hand.upper)

@@ -21,7 +21,7 @@ from dora.sim import BACKEND
 from dora.sim.actors import build_object, object_entity
 from dora.sim.batch.scene import BatchScene
 from dora.sim.grasp_tests.shake_test import Reason, validate
-from dora.sim.grasp_tests.test_scene import Physics, Rig
+from dora.sim.grasp_tests.test_scene import GraspTestScene, Physics
 
 ROBOT = load_robot("diana7_hit")
 CUBE = load_object("cube")
@@ -97,7 +97,7 @@ def test_a_body_has_mass_inertia_and_materials_of_its_own():
 @pytest.mark.parametrize("name", ["cube", "jug", "hammer", "microwave"])
 def test_every_object_rests_on_a_table_as_described(name: str):
     obj = load_object(name)
-    rig = Rig(obj, ROBOT, 0.7, Physics(), gravity=(0.0, 0.0, -9.81), carriage=True, table=True)
+    rig = GraspTestScene(obj, ROBOT, 0.7, Physics(), gravity=(0.0, 0.0, -9.81), carriage=True, table=True)
     rig.hand.reset(np.zeros(20), sapien.Pose([0.0, 0.0, 1.0]))
     start, turn = np.array([0.0, 0.0, obj.support]), np.array(obj.rest)
     rig.place(start, turn)
@@ -129,7 +129,7 @@ def test_maniskill_builds_an_object_per_environment():
 
 
 def test_the_hand_is_where_its_description_says():
-    rig = Rig(CUBE, ROBOT, 0.7, Physics(), carriage=True)
+    rig = GraspTestScene(CUBE, ROBOT, 0.7, Physics(), carriage=True)
     rig.hand.reset(JOINTS.numpy(), sapien.Pose([1.0, 0.0, 0.0]), np.array([0.1, 0.2, 0.3]))
     palm = next(link for link in rig.hand.articulation.links if link.name == ROBOT.wrist_link)
     np.testing.assert_allclose(palm.entity_pose.p, [1.1, 0.2, 0.3], atol=1e-5)
@@ -211,5 +211,5 @@ def test_an_error_in_a_process_reaches_the_caller():
 
 def test_the_scene_settings_of_others_stay():
     before = physx.get_scene_config().gravity.copy()
-    Rig(CUBE, ROBOT, 0.7, Physics(), gravity=(1.0, 2.0, 3.0))
+    GraspTestScene(CUBE, ROBOT, 0.7, Physics(), gravity=(1.0, 2.0, 3.0))
     np.testing.assert_array_equal(physx.get_scene_config().gravity, before)

@@ -18,7 +18,7 @@ from commands import call, load_command
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from dora.affordance.bundled_sets import shipped_path
+from dora.affordance.bundled_sets import bundled_path
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand.hand_mesh import HandMesh, joined
 from dora.affordance.hand.hand_model import HandModel
@@ -48,7 +48,7 @@ def free_port() -> int:
 @pytest.fixture(scope="module")
 def candidates() -> GraspCandidates:
     """Shipped grasps with invented verdicts: every third is not valid, two classes, energies 0 .. 11."""
-    shipped = GraspCandidates.load(shipped_path("cube"), robot=load_robot("diana7_hit")).select(slice(COUNT))
+    shipped = GraspCandidates.load(bundled_path("cube"), robot=load_robot("diana7_hit")).select(slice(COUNT))
     return replace(
         shipped,
         grasp_class=("BodyGrasp", "RimGrasp") * (COUNT // 2),

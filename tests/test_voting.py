@@ -154,7 +154,7 @@ def test_hand_contacts_lie_on_the_object():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
     field = SignedDistanceField(ball, dtype=torch.float64)
     wrist = torch.eye(4, dtype=torch.float64)[None].clone()
-    wrist[0, :3, 3] = -torch.tensor(hand.grip.center + 0.022 * hand.grip.normal)
+    wrist[0, :3, 3] = -torch.tensor(hand.palm_frame.center + 0.022 * hand.palm_frame.normal)
     poses = hand.forward(wrist, torch.zeros_like(hand.lower)[None])
     points, part = hand_contacts(hand, field, poses)
     touching = points[part > 0]
@@ -168,7 +168,7 @@ def test_pressed_contacts_are_the_overlapping_parts_on_the_surface():
     hand, radius = HandModel(load_robot("diana7_hit"), dtype=torch.float64), 0.03
     field = SignedDistanceField(trimesh.creation.icosphere(subdivisions=3, radius=radius), dtype=torch.float64)
     wrist = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    wrist[:, :3, 3] = -torch.tensor(hand.grip.center + 0.028 * hand.grip.normal)
+    wrist[:, :3, 3] = -torch.tensor(hand.palm_frame.center + 0.028 * hand.palm_frame.normal)
     wrist[1, 0, 3] += 1.0
     poses = hand.forward(wrist, torch.zeros(2, len(hand.lower), dtype=torch.float64))
     points, part = pressed_contacts(hand, field, poses)

@@ -19,7 +19,7 @@ def data_folder() -> Path:
     return Path(str(importlib.resources.files("dora.affordance") / "data"))
 
 
-def shipped_path(name: str) -> Path:
+def bundled_path(name: str) -> Path:
     """Where the shipped candidates of an object are."""
     return data_folder() / f"{name}.safetensors"
 
@@ -45,4 +45,4 @@ def load_candidates(name: str, robot: RobotDescription | None = None) -> GraspCa
     """
     if name not in available_objects():
         raise InputError(f"there is no object {name!r}; available: {', '.join(available_objects())}.")
-    return GraspCandidates.load(shipped_path(name), load_object(name), robot or load_robot(ROBOT))
+    return GraspCandidates.load(bundled_path(name), load_object(name), robot or load_robot(ROBOT))

@@ -20,10 +20,10 @@ from dora.affordance.objects.importing import import_object
 from dora.errors import InputError
 from dora.progress import PhaseProgress
 from dora.robot import load_robot
-from dora.sim.grasp_tests.bundle_maker import ship
+from dora.sim.grasp_tests.bundle_maker import make_bundle
 from dora.sim.grasp_tests.generation import baselines, by_region, generate, summary, voting_summary
 from dora.sim.grasp_tests.report import check_out, print_report, write_report
-from dora.tools.task_ranking import TASKS, prove_shipped, usable_in_task
+from dora.tools.task_ranking import TASKS, rank_bundled_set, usable_in_task
 
 INTERRUPTED = 130  # exit status after Ctrl-C
 BAD_INPUT = 2  # exit status after input that a person can mend
@@ -61,10 +61,10 @@ class Args:
     by_region: int = 0
     """Candidates of a search for each other region and of a free one, simulated as well: how often each region is held
     with and without asking for it, and how well the vote tells (needs --validate sapien)."""
-    ship: bool = False
+    make_bundle: bool = False
     """Make the set that comes with Dora for --object instead: enough valid grasps, ranked by simulated lifts; then
     what --prove does, where the object has a task with a table."""
-    prove: bool = False
+    rank_in_task: bool = False
     """Execute the set that comes with Dora for --object in its task, and rank it by the episodes that succeed."""
 
 
@@ -120,20 +120,20 @@ def run(args: Args) -> None:
 def remake(args: Args) -> None:
     """Make or prove the shipped set of an object."""
     name = args.object or ""
-    if not args.ship and name not in TASKS:
+    if not args.make_bundle and name not in TASKS:
         raise InputError(f"--prove needs --object, one of {', '.join(TASKS)}: no task proves {name!r}.")
     with PhaseProgress() as phases:
-        if args.ship:
-            print(ship(name, args.seed, phases, usable_in_task(name)))
+        if args.make_bundle:
+            print(make_bundle(name, args.seed, phases, usable_in_task(name)))
         if name in TASKS:
-            print(prove_shipped(name, lambda title: phases.phase(title, "episodes")))
+            print(rank_bundled_set(name, lambda title: phases.phase(title, "episodes")))
 
 
 def main() -> int:
     """Run the command; returns the exit status."""
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     try:
-        if args.ship or args.prove:
+        if args.make_bundle or args.rank_in_task:
             remake(args)
         else:
             run(args)

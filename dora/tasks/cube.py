@@ -49,7 +49,7 @@ NEAR = 0.03
 """Distance of thumb and one more fingertip from the cube's surface that ends the reach [m]."""
 HOLD = 10
 """Control steps the lifted cube must be held."""
-DEEPEST = 0.003
+PENETRATION_LIMIT = 0.003
 """Penetration above which an episode does not count as a success [m]."""
 
 
@@ -94,7 +94,7 @@ def _lift(s: Snapshot) -> Tensor:
 
 
 def _clean(s: Snapshot) -> Tensor:
-    return (_held(s) & (s.deepest <= DEEPEST)).float()
+    return (_held(s) & (s.max_penetration <= PENETRATION_LIMIT)).float()
 
 
 TERMS: Terms[Snapshot] = Terms(
@@ -113,7 +113,7 @@ TERMS: Terms[Snapshot] = Terms(
         "grasp": Term(grip, 0.4, doc="contacts: thumb against a finger, and how many fingers"),
         "lift": Term(_lift, 3.0, doc="rise, saturating at the target height"),
         "held": Term(_clean, 1.5, doc="lifted, opposed, off the table, and no overlap above 3 mm so far"),
-        **penalties(0.0005, DEEPEST),
+        **penalties(0.0005, PENETRATION_LIMIT),
     }
 )
 
@@ -188,7 +188,7 @@ class CubeEnv(DoraEnv):
     }
     DRAWS = STANDING_DRAWS
     MAX_STEPS = 100
-    DEEPEST = DEEPEST
+    PENETRATION_LIMIT = PENETRATION_LIMIT
     OBJECT = "cube"
     START = Grid(CENTRE, (SPREAD, SPREAD))
 

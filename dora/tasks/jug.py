@@ -68,7 +68,7 @@ NEAR = 0.04
 """Distance of thumb and one more fingertip from the handle that ends the reach [m]."""
 HOLD = 10
 """Control steps the lifted jug must be held."""
-DEEPEST = 0.005
+PENETRATION_LIMIT = 0.005
 """Penetration above which an episode does not count as a success [m]."""
 CLASS = "HandleGrasp"
 """The grasp class that the task asks for."""
@@ -177,7 +177,7 @@ def _lift(s: Snapshot) -> Tensor:
 
 
 def _clean(s: Snapshot) -> Tensor:
-    return (held(s) & (s.deepest <= DEEPEST)).float()
+    return (held(s) & (s.max_penetration <= PENETRATION_LIMIT)).float()
 
 
 def _tilt(s: Snapshot) -> Tensor:
@@ -202,7 +202,7 @@ TERMS: Terms[Snapshot] = Terms(
         "lift": Term(_lift, 3.0, doc="rise, saturating at the target height, less if tilted"),
         "held": Term(_clean, 1.5, doc="lifted, upright, opposed, off the table, no overlap above 5 mm so far"),
         "tilt": Term(_tilt, -1.0, "penalty", doc="tilt, as a share of the largest that counts as lifted"),
-        **penalties(0.001, DEEPEST),
+        **penalties(0.001, PENETRATION_LIMIT),
     }
 )
 
@@ -256,7 +256,7 @@ class JugEnv(DoraEnv):
     }
     DRAWS = STANDING_DRAWS
     MAX_STEPS = 120
-    DEEPEST = DEEPEST
+    PENETRATION_LIMIT = PENETRATION_LIMIT
     CONTACT_POINTS = 32
     HOME = "above"
     OBJECT = "jug"

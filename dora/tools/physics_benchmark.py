@@ -25,7 +25,7 @@ class PhysicsRow:
         physics: the settings.
         success: share of the starts that succeed.
         stages: mean number of stages done.
-        overlap_median_mm, overlap_p95_mm: deepest overlap of an episode [mm], over the starts.
+        overlap_median_mm, overlap_p95_mm: max_penetration overlap of an episode [mm], over the starts.
         tunnelled: share of starts with an overlap of more than 10 mm.
         microseconds: processor time of one control step of one environment [us].
     """
@@ -103,10 +103,10 @@ def _executed(env_id: str, physics: Physics, starts: int, preset: str, seed: int
             info = task.step(action)[-1]
             success, stage = info["success"].float(), info["stage"].float()
         spent = time.process_time() - begun
-        deepest = task.snapshot.deepest
+        max_penetration = task.snapshot.max_penetration
     finally:
         task.close()
-    median, high = (1000 * deepest.quantile(q).item() for q in (0.5, 0.95))
-    tunnelled = (deepest > TUNNELLED).float().mean().item()
+    median, high = (1000 * max_penetration.quantile(q).item() for q in (0.5, 0.95))
+    tunnelled = (max_penetration > TUNNELLED).float().mean().item()
     cost = 1e6 * spent / (starts * task.max_steps)
     return PhysicsRow(physics, success.mean().item(), stage.mean().item(), median, high, tunnelled, cost)

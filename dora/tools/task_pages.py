@@ -36,7 +36,7 @@ def tables(task: DoraEnv) -> str:
         ["control / physics", f"{task.CONTROL_FREQUENCY} / {task.PHYSICS_FREQUENCY} Hz"],
         ["episode", f"{task.MAX_STEPS} steps, {task.MAX_STEPS / task.CONTROL_FREQUENCY:g} s"],
         ["solver position iterations", str(task.SOLVER_ITERATIONS)],
-        ["deepest penetration of a success", f"{task.DEEPEST * 1000:g} mm"],
+        ["deepest penetration of a success", f"{task.PENETRATION_LIMIT * 1000:g} mm"],
     ]
     return "\n\n".join(
         (
@@ -72,9 +72,9 @@ def preset_table() -> str:
         "candidate: position": [_plus_minus(p.candidate_position, " mm", 1000.0) for p in PRESETS.values()],
         "candidate: orientation": [_plus_minus(p.candidate_rotation, " rad") for p in PRESETS.values()],
         "candidate: finger joints": [_plus_minus(p.candidate_joint, " rad") for p in PRESETS.values()],
-        "observed object position": [_plus_minus(p.seen_position, " mm", 1000.0) for p in PRESETS.values()],
-        "observed object orientation": [_plus_minus(p.seen_rotation, " rad") for p in PRESETS.values()],
-        "observed hand joints": [_plus_minus(p.seen_joint, " rad") for p in PRESETS.values()],
+        "observed object position": [_plus_minus(p.observed_position, " mm", 1000.0) for p in PRESETS.values()],
+        "observed object orientation": [_plus_minus(p.observed_rotation, " rad") for p in PRESETS.values()],
+        "observed hand joints": [_plus_minus(p.observed_joint, " rad") for p in PRESETS.values()],
         "delay of the action": delays,
         "pushes": pushes,
     }

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dora.affordance.bundled_sets import data_folder, load_candidates, shipped_path
+from dora.affordance.bundled_sets import bundled_path, data_folder, load_candidates
 from dora.affordance.candidates import GraspCandidates, concatenate
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.search.optimise import OFF_TABLE
@@ -38,7 +38,7 @@ SEED = 10_000
 
 
 @dataclass(frozen=True)
-class Proof:
+class TaskRanking:
     """What executing c candidates showed.
 
     Attributes:
@@ -86,7 +86,7 @@ class _Executor:
         return pick.tries, torch.bincount(pick.led[won], minlength=self.count)
 
 
-def prove(
+def rank_in_task(
     env_id: str,
     candidates: GraspCandidates,
     episodes: int,
@@ -94,7 +94,7 @@ def prove(
     progress: Callable[[int, int], None] | None = None,
     seed: int = SEED,
     processes: int | None = None,
-) -> Proof:
+) -> TaskRanking:
     """Executes c candidates in a task, each about equally often, where f_reach lets them.
 
     Args:
@@ -114,7 +114,7 @@ def prove(
 
     found = run_cases(_Executor, (env_id, preset, candidates), cases, processes, report, chunk=1)
     tries, wins = (torch.stack(counts).sum(0) for counts in zip(*found, strict=True))
-    return Proof(tries, wins / tries.clamp(min=1))
+    return TaskRanking(tries, wins / tries.clamp(min=1))
 
 
 def _executed(task: DoraEnv, seed: int) -> Bool[Tensor, " n"]:
@@ -125,10 +125,10 @@ def _executed(task: DoraEnv, seed: int) -> Bool[Tensor, " n"]:
     for _ in range(task.max_steps):
         *_, info = task.step(task.scripted_action())
         failed |= info["fail"]
-    return info["success"] & ~failed & (task.episode.deepest <= CLEAN * task.DEEPEST)
+    return info["success"] & ~failed & (task.episode.max_penetration <= CLEAN * task.PENETRATION_LIMIT)
 
 
-def ranked(candidates: GraspCandidates, proof: Proof) -> GraspCandidates:
+def ranked(candidates: GraspCandidates, proof: TaskRanking) -> GraspCandidates:
     """The candidates with the proof's scores, best first; among equals, those that were reached more often."""
     order = torch.argsort(proof.score + 1e-6 * proof.tries, descending=True, stable=True)
     return replace(candidates, score=proof.score).select(order)
@@ -164,7 +164,7 @@ class _Usable:
         return (task.reachable(pose.p, pose.q).float().mean(0) >= USABLE).cpu()
 
 
-def prove_shipped(name: str, phase: Callable[[str], Callable[[int, int], None]]) -> Path:
+def rank_bundled_set(name: str, phase: Callable[[str], Callable[[int, int], None]]) -> Path:
     """Executes the shipped grasps of an object's target class in its task and stores them anew, best first.
 
     All are tried a few times, and the better ones again with other starts: their scores are those of the second round,
@@ -179,20 +179,22 @@ def prove_shipped(name: str, phase: Callable[[str], Callable[[int, int], None]])
     wanted = found.of_class(obj.classes[obj.label_index(obj.target)])
     tested = found.select(wanted)
     env_id, count = TASKS[name], len(tested)
-    tested = ranked(tested, prove(env_id, tested, FIRST_TRIES * count, progress=phase(f"{name}: execute all")))
+    tested = ranked(tested, rank_in_task(env_id, tested, FIRST_TRIES * count, progress=phase(f"{name}: execute all")))
     few = math.ceil(BETTER * count)
     best, rest = tested.select(slice(few)), tested.select(slice(few, None))
-    again = prove(env_id, best, MORE_TRIES * few, progress=phase(f"{name}: execute the better ones"), seed=2 * SEED)
+    again = rank_in_task(
+        env_id, best, MORE_TRIES * few, progress=phase(f"{name}: execute the better ones"), seed=2 * SEED
+    )
     best = ranked(best, again)
     tested = concatenate([best, replace(rest, score=rest.score.clamp(max=float(best.score.min())))])
     others = [found.select(~wanted)] if not wanted.all() else []
-    path = shipped_path(name)
+    path = bundled_path(name)
     replace(concatenate([tested, *others]), settings=found.settings).save(path)
-    ship_reach_tables()
+    bundle_feasibility_tables()
     return path
 
 
-def ship_reach_tables() -> list[Path]:
+def bundle_feasibility_tables() -> list[Path]:
     """Puts the tables of f_reach of all tasks' candidates beside them, and removes those of former candidates."""
     kept = []
     for env_id in TASKS.values():

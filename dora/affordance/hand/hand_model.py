@@ -53,7 +53,7 @@ class Points:
 
 
 @dataclass(frozen=True, eq=False)
-class Grip:
+class PalmFrame:
     """How the open hand faces, unit vectors (3,) in the wrist frame, and `center` (3,) in m on the palm.
 
     `normal` points out of the palm, `along` from the palm to the fingers, `across` = along x normal.
@@ -212,7 +212,7 @@ class HandModel:
         surface = float(np.median(points[0] @ normal))
         center = bases[first:].mean(0)
         center += normal * (surface - center @ normal)
-        self.grip = Grip(normal, finger, np.cross(finger, normal), center)
+        self.palm_frame = PalmFrame(normal, finger, np.cross(finger, normal), center)
 
     def forward(self, wrist: Float[Tensor, "c 4 4"], actuated: Float[Tensor, "c a"]) -> Float[Tensor, "c b 4 4"]:
         """Poses of all bodies in the frame in which `wrist` is given; `actuated` joints in rad."""

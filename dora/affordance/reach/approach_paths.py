@@ -1,4 +1,4 @@
-"""Ways of the arm to candidates: along the approach, and what leads to its beginning."""
+"""Paths of the arm to candidates: along the approach, and what leads to its beginning."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Goals:
 
 
 @dataclass(frozen=True, eq=False)
-class Ways:
+class ApproachPaths:
     """One way per goal.
 
     Attributes:
@@ -91,7 +91,7 @@ class Ways:
 
 def attempts(
     kinematics: InverseKinematics, goals: Goals, start: Float[Tensor, " dof"], settings: ReachSettings
-) -> Iterator[Callable[[Int[Tensor, " m"]], Ways]]:
+) -> Iterator[Callable[[Int[Tensor, " m"]], ApproachPaths]]:
     """Functions from rows of `goals` to ways, best way first; ask the next one for the rows the last one failed."""
     if settings.motion == "servo":
         yield lambda rows: _servo(kinematics, goals[rows], start, settings)
@@ -106,8 +106,8 @@ def _count(settings: ReachSettings) -> int:
     return 1 + max(1, round(settings.standoff / settings.spacing))
 
 
-def _servo(kinematics: InverseKinematics, goals: Goals, start: Tensor, settings: ReachSettings) -> Ways:
-    """Ways of the wrist controller; where it fails, the reason is out of reach if there is no solution at all."""
+def _servo(kinematics: InverseKinematics, goals: Goals, start: Tensor, settings: ReachSettings) -> ApproachPaths:
+    """Paths of the wrist controller; where it fails, the reason is out of reach if there is no solution at all."""
     path = goals.position, goals.quaternion, goals.approach, settings.standoff
     m = roll_out(kinematics.chain, start, *path, settings.controller)
     failure = torch.where(m.reached, OK, NO_MOTION)
@@ -118,7 +118,7 @@ def _servo(kinematics: InverseKinematics, goals: Goals, start: Tensor, settings:
     steps = (m.arrival[:, None] + share * (m.finish - m.arrival)[:, None]).round().long()
     descent = m.q.gather(1, steps[:, :, None].expand(-1, -1, m.q.shape[-1]))
     ends = m.arrival.tolist()
-    return Ways(descent, [q[: end + 1 : settings.stride] for q, end in zip(m.q, ends, strict=True)], failure)
+    return ApproachPaths(descent, [q[: end + 1 : settings.stride] for q, end in zip(m.q, ends, strict=True)], failure)
 
 
 def _tracked(
@@ -128,8 +128,8 @@ def _tracked(
     rank: int,
     settings: ReachSettings,
     rows: Tensor,
-) -> Ways:
-    """Ways from the solutions of one rank back to the standoff, each posture from the one before."""
+) -> ApproachPaths:
+    """Paths from the solutions of one rank back to the standoff, each posture from the one before."""
     goals, count = goals[rows], _count(settings)
     q = solutions.q[rows, rank]
     back = torch.linspace(0, settings.standoff, count)[1:]
@@ -140,4 +140,4 @@ def _tracked(
     jumps = ((path[:, 1:] - path[:, :-1]).abs() > kinematics.chain.velocity * time).flatten(1).any(1)
     failure = torch.where(tracked.all(1) & ~jumps, OK, NOT_CONTINUOUS)
     failure = torch.where(solutions.solved[rows, rank], failure, OUT_OF_REACH)
-    return Ways(path, [None] * len(rows), failure)
+    return ApproachPaths(path, [None] * len(rows), failure)

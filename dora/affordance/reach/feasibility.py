@@ -24,9 +24,9 @@ from dora.affordance.reach.approach_paths import (
     NO_MOTION,
     OK,
     REASONS,
+    ApproachPaths,
     Goals,
     ReachSettings,
-    Ways,
     attempts,
 )
 from dora.errors import InputError
@@ -39,7 +39,7 @@ from dora.geometry.rotations import (
 )
 from dora.robot import RobotDescription, Shape
 from dora.robot.motion.collision import CollisionModel
-from dora.robot.motion.height_bounds import ArmExtent, HandExtent
+from dora.robot.motion.height_bounds import ArmHeightBounds, HandHeightBounds
 from dora.robot.motion.inverse_kinematics import InverseKinematics
 from dora.robot.motion.planning import plan
 
@@ -110,7 +110,7 @@ class Reach:
         up = torch.tensor([0.0, 0.0, 1.0])
         self._normal = quaternion_apply(quaternion_inverse(self._base_q), up)
         self._level = self.settings.table_height - float(self._base_p[2])
-        self._hand, self._arm = HandExtent(robot), ArmExtent(robot, self.kinematics.chain)
+        self._hand, self._arm = HandHeightBounds(robot), ArmHeightBounds(robot, self.kinematics.chain)
         self._models: dict[str, CollisionModel] = {}
 
     def filter(
@@ -146,13 +146,13 @@ class Reach:
         for attempt in attempts(self.kinematics, goals[rows], self.start, s):
             if len(left) == 0:
                 break
-            ways, now = attempt(left), rows[left]
-            low = self._arm.height(ways.descent, self._normal, self._level).amin(-1) < s.table_clearance
-            failure = torch.where((ways.failure == OK) & low, ARM_COLLISION, ways.failure)
+            paths, now = attempt(left), rows[left]
+            low = self._arm.height(paths.descent, self._normal, self._level).amin(-1) < s.table_clearance
+            failure = torch.where((paths.failure == OK) & low, ARM_COLLISION, paths.failure)
             if exact:
-                failure = self._collisions(candidates, poses, now, ways, failure)
+                failure = self._collisions(candidates, poses, now, paths, failure)
             better = (failure == OK) | (failure > reason[now])
-            arm_q[now[better]], standoff_q[now[better]] = ways.descent[better, -1], ways.descent[better, 0]
+            arm_q[now[better]], standoff_q[now[better]] = paths.descent[better, -1], paths.descent[better, 0]
             reason[now] = torch.where(failure == OK, OK, torch.maximum(reason[now], failure))
             left = left[failure != OK]
         dof = arm_q.shape[-1]
@@ -233,7 +233,12 @@ class Reach:
         return lowest + goals.position @ self._normal - self._level
 
     def _collisions(
-        self, candidates: GraspCandidates, poses: tuple[Tensor, Tensor], rows: Tensor, ways: Ways, failure: Tensor
+        self,
+        candidates: GraspCandidates,
+        poses: tuple[Tensor, Tensor],
+        rows: Tensor,
+        paths: ApproachPaths,
+        failure: Tensor,
     ) -> Tensor:
         """`failure` with what Coal finds on the approach and before it."""
         failure, c = failure.clone(), len(candidates)
@@ -244,10 +249,10 @@ class Reach:
             pose, hand = divmod(int(rows[i]), c)
             approach.place_object(position[pose], quaternion[pose])
             transit.place_object(position[pose], quaternion[pose])
-            descent = ways.descent[i].double().numpy()
+            descent = paths.descent[i].double().numpy()
             if not approach.free(descent, hands[hand]):
                 failure[i] = ARM_COLLISION
-            elif not self._arrives(transit, ways.transit[i], descent[0], hands[hand]):
+            elif not self._arrives(transit, paths.transit[i], descent[0], hands[hand]):
                 failure[i] = NO_MOTION
         return failure
 

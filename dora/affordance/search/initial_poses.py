@@ -58,8 +58,9 @@ class InitialPoses:
         normals = np.asarray(surface.face_normals[faces])
         self.normals = torch.as_tensor(normals, dtype=hand.dtype, device=hand.device)
         self.axes, self.elongated = long_axes(self.points)
-        self.frame = self.points.new_tensor(np.stack((hand.grip.normal, hand.grip.across, hand.grip.along)).copy())
-        self.center = self.points.new_tensor(hand.grip.center)
+        palm = hand.palm_frame
+        self.frame = self.points.new_tensor(np.stack((palm.normal, palm.across, palm.along)).copy())
+        self.center = self.points.new_tensor(palm.center)
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c a"]]:
         """Wrist poses in the object frame and actuated joints (rad)."""

@@ -135,7 +135,7 @@ def _candidates(
         points, finger = pressed_contacts(hand, energy.field, closed[best])
     held = vote(map_of(obj, str(points.device)), points, finger)
     full = robot.expand_hand(joints)
-    normal = full.new_tensor(hand.grip.normal)
+    normal = full.new_tensor(hand.palm_frame.normal)
     return GraspCandidates(
         object=obj.name,
         position=wrist[:, :3, 3].contiguous(),
@@ -220,6 +220,6 @@ def opened(energy: GraspEnergy, wrist: Float[Tensor, "c 4 4"], joints: Float[Ten
         poses = hand.forward(wrist, hand.robot.reduce_hand(torch.lerp(joints, wide, trial)))
         depth = hand.sphere_radius - energy.field.distance(hand.place(poses, hand.spheres))
         part = hand.part[hand.spheres.body] - 2
-        deepest = torch.stack([depth[:, part == index].amax(1) for index in range(hand.fingers)], 1)
-        share = torch.where((deepest < OPENING_DEPTH) & (share == trial - OPENINGS[0]), trial, share)
+        overlap = torch.stack([depth[:, part == index].amax(1) for index in range(hand.fingers)], 1)
+        share = torch.where((overlap < OPENING_DEPTH) & (share == trial - OPENINGS[0]), trial, share)
     return torch.lerp(joints, wide, share[:, owner])

@@ -96,7 +96,7 @@ def hold(
         robot.effort[index].astype(float),
         1 / (robot.stiffness[index] + FINGER_CONTACTS * STIFFNESS * lever**2),
     )
-    center = torch.as_tensor(hand.grip.center + ARM * hand.grip.normal).double().numpy()
+    center = torch.as_tensor(hand.palm_frame.center + ARM * hand.palm_frame.normal).double().numpy()
     plane = energy.plane() if on_table else np.array([0.0, 0.0, 0.0, np.inf])
     model = Model(free, energy.field_arrays, drives, center, float(protocol.friction), plane)
     load = SAFETY * mass * protocol.gravity

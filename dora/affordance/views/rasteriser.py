@@ -128,14 +128,14 @@ def _nearest_faces(faces: Float[np.ndarray, "f 3 3"], size: tuple[int, int]) -> 
     span = np.maximum(high - low, 0)
     count = span[:, 0] * span[:, 1]
     best = np.zeros(height * width, dtype=np.int64)
-    deepest = faces[..., 2].max() * 1.001
+    farthest = faces[..., 2].max() * 1.001
     for chunk in np.array_split(np.arange(len(faces)), max(1, -(-int(count.sum()) // CHUNK))):
         face = np.repeat(chunk, count[chunk])
         place = np.arange(len(face)) - np.repeat(np.cumsum(count[chunk]) - count[chunk], count[chunk])
         column = low[face, 0] + place % np.maximum(span[face, 0], 1)
         row = low[face, 1] + place // np.maximum(span[face, 0], 1)
         inside, inverse = _barycentric(faces[face], column + 0.5, row + 0.5)
-        key = (inverse / deepest * DEPTHS).astype(np.int64) * (len(faces) + 1) + face + 1
+        key = (inverse / farthest * DEPTHS).astype(np.int64) * (len(faces) + 1) + face + 1
         np.maximum.at(best, (row * width + column)[inside], key[inside])
     return np.where(best == 0, len(faces), best % (len(faces) + 1) - 1).reshape(height, width)
 

@@ -47,7 +47,7 @@ def _spheres(robot: RobotDescription, link: str) -> tuple[Tensor, Tensor]:
     return centres, torch.tensor(np.repeat([r for _, r in parts], [len(p) for p, _ in parts]), dtype=torch.float32)
 
 
-class HandExtent:
+class HandHeightBounds:
     """The hand as spheres in the frame of its wrist link."""
 
     def __init__(self, robot: RobotDescription):
@@ -75,7 +75,7 @@ class HandExtent:
         return torch.cat(parts, 1)
 
 
-class ArmExtent:
+class ArmHeightBounds:
     """The links between the first joint and the wrist as spheres; `chain` is that from root to wrist."""
 
     def __init__(self, robot: RobotDescription, chain: SerialChain):

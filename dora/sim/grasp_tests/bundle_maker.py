@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dora.affordance.bundled_sets import ROBOT, shipped_path
+from dora.affordance.bundled_sets import ROBOT, bundled_path
 from dora.affordance.candidates import GraspCandidates, concatenate
 from dora.affordance.hand.protocol import STANDARD
 from dora.affordance.objects.affordance_object import AffordanceObject
@@ -53,7 +53,7 @@ Usable = Callable[[GraspCandidates], Bool[Tensor, " c"]]
 """Tells which grasps a task can use."""
 
 
-def ship(name: str, seed: int, phases: PhaseProgress, usable: Usable | None = None) -> Path:
+def make_bundle(name: str, seed: int, phases: PhaseProgress, usable: Usable | None = None) -> Path:
     """Make and write the shipped set of an object; returns its file.
 
     Args:
@@ -67,7 +67,7 @@ def ship(name: str, seed: int, phases: PhaseProgress, usable: Usable | None = No
         InputError: unknown object, or too few valid grasps.
     """
     maker = SetMaker(load_object(name), load_robot(ROBOT), phases, usable)
-    path = shipped_path(name)
+    path = bundled_path(name)
     path.parent.mkdir(exist_ok=True)
     maker.make(seed).save(path)
     return path

@@ -9,13 +9,13 @@ import sapien
 
 
 @dataclass(frozen=True)
-class Grip:
+class HandContacts:
     """Contact points between hand and object.
 
     Attributes:
         part: (k,) hand part of each point.
         force: (k,) magnitude of the impulse over the length of the step [N].
-        point: (k, 3) in the world frame, or in that of `seen_from` [m].
+        point: (k, 3) in the world frame, or in that of `in_frame` [m].
         depth: deepest overlap over all points [m]; 0 if none overlap.
     """
 
@@ -33,13 +33,13 @@ class Grip:
         """Sum of the magnitudes per hand part, (parts,) [N]."""
         return np.bincount(self.part, self.force, parts)
 
-    def seen_from(self, frame: sapien.Pose) -> "Grip":
+    def in_frame(self, frame: sapien.Pose) -> "HandContacts":
         """The same with points in a frame whose pose in the world is given."""
         matrix = frame.inv().to_transformation_matrix()
         return replace(self, point=self.point @ matrix[:3, :3].T + matrix[:3, 3])
 
 
-class GripReader:
+class HandContactReader:
     """Reads the contacts between one body and a hand.
 
     Args:
@@ -52,7 +52,7 @@ class GripReader:
     def __init__(self, contacts: Callable[[], list], body: Any, part_of: Mapping[int, int], timestep: float):
         self._contacts, self._body, self._part_of, self._timestep = contacts, body, part_of, timestep
 
-    def read(self) -> Grip:
+    def read(self) -> HandContacts:
         """Contacts of the last step; points that PhysX only watches carry no force."""
         part, impulse, point, depth = [], [], [], 0.0
         for contact in self._contacts():
@@ -71,4 +71,4 @@ class GripReader:
                 impulse.append(p.impulse)
                 point.append(p.position)
         force = np.linalg.norm(np.reshape(impulse, (-1, 3)), axis=1) / self._timestep
-        return Grip(np.array(part, np.int64), force, np.reshape(point, (-1, 3)), -depth)
+        return HandContacts(np.array(part, np.int64), force, np.reshape(point, (-1, 3)), -depth)

@@ -28,7 +28,7 @@ from dora.geometry.rotations import (
 from dora.parallel import Progress, run_cases
 from dora.robot import RobotDescription
 from dora.sim.grasp_tests.shake_test import check_object
-from dora.sim.grasp_tests.test_scene import Physics, Rig
+from dora.sim.grasp_tests.test_scene import GraspTestScene, Physics
 
 Purpose = Literal["ranking", "reporting"]
 _STREAM: dict[Purpose, int] = {"ranking": 0, "reporting": 1}
@@ -103,7 +103,7 @@ class LiftTest:
         self.execution, self.physics = execution, physics
         self.rest = np.array([0.0, 0.0, obj.support]), np.array(obj.rest)
         gravity = (0.0, 0.0, -STANDARD.gravity)
-        self.rig = Rig(obj, robot, STANDARD.friction, physics, gravity, carriage=True, table=True)
+        self.rig = GraspTestScene(obj, robot, STANDARD.friction, physics, gravity, carriage=True, table=True)
 
     def __call__(self, lift: Lift) -> bool:
         """Reach, close, lift and hold."""
@@ -136,7 +136,7 @@ class LiftTest:
             self.rig.run(self.physics.steps(1 / COMMANDS))
 
     def _succeeded(self) -> bool:
-        pose, grip = self.rig.pose, self.rig.read_grip()
+        pose, grip = self.rig.pose, self.rig.read_contacts()
         cosine = min(1.0, abs(float(np.dot(pose.q, self.rest[1]))))
         up = float(pose.p[2] - self.rest[0][2]) > self.execution.lifted
         return up and grip.held and bool(2 * np.arccos(cosine) < self.execution.turn)

@@ -21,8 +21,8 @@ from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion, quaternion_apply, quaternion_inverse
 from dora.parallel import Progress, run_cases
 from dora.robot import RobotDescription
-from dora.sim.grasp_tests.hand_contacts import Grip
-from dora.sim.grasp_tests.test_scene import Physics, Rig
+from dora.sim.grasp_tests.hand_contacts import HandContacts
+from dora.sim.grasp_tests.test_scene import GraspTestScene, Physics
 
 LOOK = 0.05
 """Time between measurements of the displacement [s]."""
@@ -63,13 +63,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Trial:
-    """What became of one candidate; as `Validation`, and the grip after closing in the object frame."""
+    """What became of one candidate; as `Validation`, and the contacts after closing in the object frame."""
 
     reason: Reason
     displacement: float
     closing_shift: float
     penetration: float
-    grip: Grip | None
+    touch: HandContacts | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,13 +132,13 @@ class Validation:
         return torch.where(self.label_force.sum(1) > 0, self.label_force.argmax(1), -1)
 
 
-class GripTest:
+class ShakeTest:
     """Simulates one candidate after the other; arguments as of `validate`."""
 
     def __init__(self, obj: AffordanceObject, robot: RobotDescription, protocol: Protocol, physics: Physics):
         self.protocol, self.physics = protocol, physics
         self.weight = obj.mass * protocol.gravity
-        self.rig = Rig(obj, robot, protocol.friction, physics)
+        self.rig = GraspTestScene(obj, robot, protocol.friction, physics)
 
     def __call__(self, case: Case) -> Trial:
         """Closes the hand and, if the object is still there, tries all directions."""
@@ -147,9 +147,9 @@ class GripTest:
         shift = self._close(case)
         if not shift < THROWN:
             return Trial(Reason.THROWN, 0.0, shift, 0.0, None)
-        grip = self.rig.read_grip()
+        touch = self.rig.read_contacts()
         reason, displacement, depth = self._shake(case)
-        return Trial(reason, displacement, shift, max(grip.depth, depth), grip.seen_from(self.start))
+        return Trial(reason, displacement, shift, max(touch.depth, depth), touch.in_frame(self.start))
 
     def _close(self, case: Case) -> float:
         """The hand moves from its opened to its squeezing posture; returns the object's shift [m]."""
@@ -187,9 +187,9 @@ class GripTest:
                 if not farthest <= self.protocol.displacement:
                     return Reason.SLIPPED, farthest, depth
                 if look % round(TOUCH / LOOK) == 0 or look == looks:
-                    grip = rig.read_grip()
-                    depth = max(depth, grip.depth)
-            if not grip.held:
+                    touch = rig.read_contacts()
+                    depth = max(depth, touch.depth)
+            if not touch.held:
                 return Reason.RELEASED, farthest, depth
         return Reason.PASSED, farthest, depth
 
@@ -222,18 +222,18 @@ def validate(
         RuntimeError: a simulating process died.
     """
     check_object(candidates, obj)
-    trials = run_cases(GripTest, (obj, robot, protocol, physics or Physics()), _cases(candidates), processes, progress)
+    trials = run_cases(ShakeTest, (obj, robot, protocol, physics or Physics()), _cases(candidates), processes, progress)
     parts = 1 + len(robot.fingers)
-    grips = [trial.grip for trial in trials]
-    points, finger = _pressed(grips)
+    contacts = [trial.touch for trial in trials]
+    points, finger = _pressed(contacts)
     numbers = torch.tensor([(t.displacement, t.closing_shift, t.penetration) for t in trials])
     return Validation(
         reason=torch.tensor([int(trial.reason) for trial in trials]),
         displacement=numbers[:, 0],
         closing_shift=numbers[:, 1],
         penetration=numbers[:, 2],
-        part_force=torch.tensor(np.array([_part_force(grip, parts) for grip in grips]), dtype=torch.float32),
-        label_force=_label_force(grips, obj),
+        part_force=torch.tensor(np.array([_part_force(touch, parts) for touch in contacts]), dtype=torch.float32),
+        label_force=_label_force(contacts, obj),
         contacts=points,
         contact_finger=finger,
         candidate_penetration=candidates.penetration.cpu(),
@@ -255,30 +255,30 @@ def _cases(candidates: GraspCandidates) -> list[Case]:
     return [Case(*row) for row in zip(*(field.cpu().numpy() for field in fields), strict=True)]
 
 
-def _part_force(grip: Grip | None, parts: int) -> np.ndarray:
-    return np.zeros(parts) if grip is None else grip.by_part(parts)
+def _part_force(touch: HandContacts | None, parts: int) -> np.ndarray:
+    return np.zeros(parts) if touch is None else touch.by_part(parts)
 
 
-def _pressed(grips: list[Grip | None]) -> tuple[Float[Tensor, "c k 3"], Int[Tensor, "c k"]]:
+def _pressed(contacts: list[HandContacts | None]) -> tuple[Float[Tensor, "c k 3"], Int[Tensor, "c k"]]:
     """Points that carry force and their contact classes, filled up to the largest number of them."""
-    pressing = [np.zeros(0, np.int64) if grip is None else np.flatnonzero(grip.force > 0) for grip in grips]
+    pressing = [np.zeros(0, np.int64) if touch is None else np.flatnonzero(touch.force > 0) for touch in contacts]
     most = max(map(len, pressing))
-    points, finger = torch.zeros(len(grips), most, 3), torch.zeros(len(grips), most, dtype=torch.long)
-    for row, (grip, index) in enumerate(zip(grips, pressing, strict=True)):
-        if grip is not None:
-            points[row, : len(index)] = torch.tensor(grip.point[index], dtype=torch.float32)
-            finger[row, : len(index)] = torch.tensor(1 + grip.part[index])
+    points, finger = torch.zeros(len(contacts), most, 3), torch.zeros(len(contacts), most, dtype=torch.long)
+    for row, (touch, index) in enumerate(zip(contacts, pressing, strict=True)):
+        if touch is not None:
+            points[row, : len(index)] = torch.tensor(touch.point[index], dtype=torch.float32)
+            finger[row, : len(index)] = torch.tensor(1 + touch.part[index])
     return points, finger
 
 
-def _label_force(grips: list[Grip | None], obj: AffordanceObject) -> Float[Tensor, "c labels"]:
+def _label_force(contacts: list[HandContacts | None], obj: AffordanceObject) -> Float[Tensor, "c labels"]:
     """Force by the region of the surface point nearest to each contact point, all candidates at once."""
-    found = torch.zeros(len(grips), len(obj.labels))
-    known = [(row, grip) for row, grip in enumerate(grips) if grip is not None and len(grip.part)]
+    found = torch.zeros(len(contacts), len(obj.labels))
+    known = [(row, touch) for row, touch in enumerate(contacts) if touch is not None and len(touch.part)]
     if known:
-        points = torch.tensor(np.concatenate([grip.point for _, grip in known]), dtype=torch.float32)
-        force = torch.tensor(np.concatenate([grip.force for _, grip in known]), dtype=torch.float32)
-        row = torch.tensor(np.repeat([row for row, _ in known], [len(grip.part) for _, grip in known]))
+        points = torch.tensor(np.concatenate([touch.point for _, touch in known]), dtype=torch.float32)
+        force = torch.tensor(np.concatenate([touch.force for _, touch in known]), dtype=torch.float32)
+        row = torch.tensor(np.repeat([row for row, _ in known], [len(touch.part) for _, touch in known]))
         _, label = map_of(obj, "cpu").nearest(points, 1)
         found.index_put_((row, label[:, 0]), force, accumulate=True)
     return found

@@ -14,7 +14,7 @@ from dora.errors import InputError
 from dora.robot import RobotDescription
 from dora.sim.actors import object_entity
 from dora.sim.grasp_tests.floating_hand import FloatingHand
-from dora.sim.grasp_tests.hand_contacts import GripReader
+from dora.sim.grasp_tests.hand_contacts import HandContactReader
 
 TABLE_HALF = (1.0, 1.0, 0.05)
 """Half extents of the table [m]; its upper face is z = 0."""
@@ -61,7 +61,7 @@ def _gravity(gravity: Sequence[float]):
         physx.set_scene_config(gravity=kept[0], enable_tgs=kept[1])
 
 
-class Rig:
+class GraspTestScene:
     """A scene with a floating hand and a free object, reused for many grasps.
 
     Args:
@@ -107,7 +107,7 @@ class Rig:
         self._materials = [shape.physical_material for body in bodies for shape in body.collision_shapes]
         if table:
             self._add_table(friction)
-        self.read_grip = GripReader(system.get_contacts, self.body, self.hand.part_of, system.timestep).read
+        self.read_contacts = HandContactReader(system.get_contacts, self.body, self.hand.part_of, system.timestep).read
 
     def _add_table(self, friction: float) -> None:
         shape = physx.PhysxCollisionShapeBox(list(TABLE_HALF), physx.PhysxMaterial(friction, friction, 0.0))

@@ -34,7 +34,7 @@ class DoraEnv(BuiltEnv):
     """How many uniform random numbers one initial state needs, besides mass, friction and errors."""
 
     _snapshot: Snapshot | None = None
-    _seen: Snapshot
+    _observed: Snapshot
 
     @abstractmethod
     def place(self, env_idx: Tensor, u: Tensor) -> None:
@@ -86,15 +86,15 @@ class DoraEnv(BuiltEnv):
         return self._snapshot
 
     @property
-    def seen(self) -> Snapshot:
+    def observed(self) -> Snapshot:
         """The same state with the preset's noise: what the policy and the reference know of it."""
         _ = self.snapshot
-        return self._seen
+        return self._observed
 
     def _read(self, step: Int[Tensor, " n"]) -> Snapshot:
         time = step / self.MAX_STEPS
         s = self.extended(self._reader.snapshot(self.machine, self.guide, self.episode, self.object_half, time))
-        self._seen = self.disturbances.seen(s, self.guide.choice, step)
+        self._observed = self.perturbations.observed(s, self.guide.choice, step)
         return s
 
     # ------------------------------------------------------------------ reset
@@ -138,7 +138,7 @@ class DoraEnv(BuiltEnv):
         e.friction[env_idx] = low + (high - low) * friction[:, 0]
         self._apply_properties(env_idx)
         self.machine.reset(env_idx)
-        self.disturbances.begin(env_idx, key[:, 0])
+        self.perturbations.begin(env_idx, key[:, 0])
         self._choose(env_idx, pose.p[env_idx], pose.q[env_idx], 2 * error - 1)
 
     def _choose(self, env_idx: Tensor, object_p: Tensor, object_q: Tensor, error: Tensor) -> None:
@@ -174,11 +174,11 @@ class DoraEnv(BuiltEnv):
         command = None
         if action is not None:
             self.episode.record_action(action)
-            action = self.disturbances.delayed(action, step)
+            action = self.perturbations.delayed(action, step)
             command = self._command(action)
         elif self.agent.commands_wrist:
             self.agent.wrist_controller.hold()
-        self._push(self.disturbances.pushes(step))
+        self._push(self.perturbations.pushes(step))
         super()._step_action(command)
         seen = self.control_freq if self.CONTACT_EVERY_STEP else self.sim_freq
         self.episode.record_contacts(self._reader.contacts(), seen)
@@ -187,10 +187,10 @@ class DoraEnv(BuiltEnv):
         s = self._read(step + 1)  # ManiSkill counts the step after this method
         self.episode.record_rise(lifted(s))
         self.machine.advance(s)
-        self.reference.advance(self._seen)
+        self.reference.advance(self._observed)
         moved = {"stage": self.machine.index.clone(), "phase": self.reference.one_hot()}
         self._snapshot = advanced(s, **moved)
-        self._seen = self._snapshot if self._seen is s else advanced(self._seen, **moved)
+        self._observed = self._snapshot if self._observed is s else advanced(self._observed, **moved)
         return action
 
     def _checked(self, action: Any) -> Tensor | None:
@@ -212,7 +212,7 @@ class DoraEnv(BuiltEnv):
         """What the controller is asked: the action itself, or the corrected reference."""
         if not self.corrects:
             return action
-        return self._encode(self.guide.corrected(self.seen, action, self.agent.wrist_controller.expand_hand))
+        return self._encode(self.guide.corrected(self.observed, action, self.agent.wrist_controller.expand_hand))
 
     def _encode(self, target: Target) -> Tensor:
         """A wrist and hand target as an action of the wrist controller."""
@@ -229,7 +229,7 @@ class DoraEnv(BuiltEnv):
         """
         if self.corrects:
             return torch.zeros(self.num_envs, self.action_size, device=self.device)
-        target = self.reference.target(self.seen)
+        target = self.reference.target(self.observed)
         self.reference.aim(target)
         return self._encode(target)
 
@@ -242,7 +242,7 @@ class DoraEnv(BuiltEnv):
             "task": task,
             "machine": self.machine.get_state(),
             "guide": self.guide.get_state(),
-            "disturbances": self.disturbances.get_state(),
+            "perturbations": self.perturbations.get_state(),
         }
         rows = {name: {k: v.flatten(min(1, v.ndim - 1)) for k, v in part.items()} for name, part in ours.items()}
         return cast(dict[str, Any], super().get_state_dict()) | rows  # annotated as a tensor
@@ -264,7 +264,7 @@ class DoraEnv(BuiltEnv):
             self._elapsed_steps[rows] = state["task"]["elapsed"].reshape(-1).to(self._elapsed_steps.dtype)
             self.machine.set_state(state["machine"], rows)
             self.guide.set_state(state["guide"], rows)
-            self.disturbances.set_state(state["disturbances"], rows)
+            self.perturbations.set_state(state["perturbations"], rows)
             self._apply_properties(rows)
         self._snapshot = None
 

@@ -23,13 +23,13 @@ from dora.sim.robot_agent import DescribedRobot
 from dora.tasks.env.episode_memory import Episode
 from dora.tasks.env.judging import JudgedEnv
 from dora.tasks.env.options import check_options
-from dora.tasks.env.perturbations import Disturbances
+from dora.tasks.env.perturbations import Perturbations
 from dora.tasks.env.state_reader import SimulatorReader
 from dora.tasks.env.table import add_table
 from dora.tasks.guidance.candidate_choice import Choice
 from dora.tasks.guidance.grasp_and_lift import GraspReference, Guide
 from dora.tasks.guidance.reference import Reference
-from dora.tasks.guidance.residual_action import Bounds, Correction
+from dora.tasks.guidance.residual_action import Bounds, ResidualAction
 from dora.tasks.mdp.guidance_parts import PRIOR
 
 SCALE_DRAW = 256
@@ -175,10 +175,10 @@ class BuiltEnv(JudgedEnv):
         self._properties = ObjectProperties(self.target_object)
         self._load_judgement()
         choice = Choice(self.prepared(self._grasps or self.candidates()), self.num_envs, self.device)
-        correction = Correction(*size, self.BOUNDS, self.device)
+        correction = ResidualAction(*size, self.BOUNDS, self.device)
         self.guide = Guide(self.parts, choice, self.make_reference(), correction)
         self.guide.anneal(**self._shares)
-        self.disturbances = Disturbances(self.preset, *size, self.CONTROL_FREQUENCY, self.device)
+        self.perturbations = Perturbations(self.preset, *size, self.CONTROL_FREQUENCY, self.device)
         self.episode = Episode(*size, points, self.device)
         self._home = self.agent.posture_wrist(self.HOME)
 

@@ -24,7 +24,7 @@ class Episode:
 
         self.start_p, self.highest = zeros(3), zeros()
         self.touch, self.force, self.supported = zeros(6), zeros(6), zeros()
-        self.penetration, self.deepest = zeros(), zeros()
+        self.penetration, self.max_penetration = zeros(), zeros()
         self.mass, self.friction = zeros(), zeros()
         self.contact_p, self.contact_finger = zeros(points, 3), zeros(points)
         self.action, self.previous_action = zeros(action_size), zeros(action_size)
@@ -45,7 +45,7 @@ class Episode:
         self.touch.copy_(force > 0)
         self.supported.copy_(contacts.impulse[:, OBJECT, WORLD].square().sum(-1) > 0)
         self.penetration.copy_(torch.maximum(hand, depth[:, OBJECT, WORLD]))
-        torch.maximum(self.deepest, self.penetration, out=self.deepest)
+        torch.maximum(self.max_penetration, self.penetration, out=self.max_penetration)
 
     def record_points(self, position: Float[Tensor, "n m 3"], finger: Int[Tensor, "n m"]) -> None:
         """Takes over the contact points of the last physics step, object frame [m]; finger 0 marks an empty row."""

@@ -39,7 +39,7 @@ class JudgedEnv(BaseEnv):
     """Observation entries beyond `OBSERVATIONS`."""
     MAX_STEPS: ClassVar[int]
     """Episode limit [control steps]."""
-    DEEPEST: ClassVar[float] = 0.005
+    PENETRATION_LIMIT: ClassVar[float] = 0.005
     """Penetration that spoils an episode [m]."""
 
     parts: frozenset[str]
@@ -55,7 +55,7 @@ class JudgedEnv(BaseEnv):
 
     @property
     @abstractmethod
-    def seen(self) -> Snapshot:
+    def observed(self) -> Snapshot:
         """The same state as it is observed, with the preset's noise."""
 
     def _load_judgement(self) -> None:
@@ -88,9 +88,9 @@ class JudgedEnv(BaseEnv):
     # ---------------------------------------------------- evaluation, reward
 
     @property
-    def spoiled(self) -> Tensor:
+    def over_penetrated(self) -> Tensor:
         """(n,) bool: the episode's deepest penetration is above the task's limit."""
-        return self.episode.deepest > self.DEEPEST
+        return self.episode.max_penetration > self.PENETRATION_LIMIT
 
     @property
     def unreachable(self) -> Tensor:
@@ -100,19 +100,19 @@ class JudgedEnv(BaseEnv):
         return none_left if FILTER in self.parts else torch.zeros_like(none_left)
 
     def evaluate(self) -> dict[str, Tensor]:
-        """Success: all stages done, the episode neither spoiled nor failing now, as a jug that is dropped again does.
+        """Success: all stages done, no overlap above the limit, and no failure now, as of a jug that is dropped again.
 
         Idempotent: reset and wrappers call it too, so it moves nothing.
         """
         finished, fail = self.machine.finished, self.failed(self.snapshot) | self.unreachable
         info = {
-            "success": finished & ~self.spoiled & ~fail,
+            "success": finished & ~self.over_penetrated & ~fail,
             "fail": fail,
             "unreachable": self.unreachable,
             "finished": finished,
             "stage": self.machine.index.clone(),
             "penetration_mm": self.episode.penetration * MM,
-            "penetration_max_mm": self.episode.deepest * MM,
+            "penetration_max_mm": self.episode.max_penetration * MM,
         }
         for k, stage in enumerate(self.machine.stages):
             info[f"stage/{stage.name}"] = self.machine.furthest > k
@@ -146,7 +146,7 @@ class JudgedEnv(BaseEnv):
         return {}
 
     def _get_obs_extra(self, info: dict) -> dict[str, Tensor]:
-        s = self.seen
+        s = self.observed
         return {name: entry.value(s) for name, entry in self.observation_entries.items()}
 
     def _flatten_raw_obs(self, obs: Any) -> Any:

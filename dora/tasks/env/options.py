@@ -12,7 +12,7 @@ from dora.robot import available_robots
 from dora.sim.batch.rendering import can_render
 from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot, register_robot
 from dora.tasks.mdp.guidance_parts import guidance_in_force
-from dora.tasks.mdp.randomisation import Preset, find_preset
+from dora.tasks.mdp.randomisation import Randomisation, find_preset
 
 
 def choose_render_backend(render_mode: str | None, obs_mode: str | None) -> str:
@@ -36,7 +36,7 @@ class TaskOptions:
     """Checked options of a task, with what they resolve to."""
 
     parts: frozenset[str]
-    preset: Preset
+    preset: Randomisation
     robot: str
     control_mode: str
     sim_backend: str

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.tasks.guidance.candidate_choice import Choice
-from dora.tasks.mdp.randomisation import Preset
+from dora.tasks.mdp.randomisation import Randomisation
 from dora.tasks.mdp.snapshot import S, observed
 
 KEYS = 2**24
@@ -40,7 +40,7 @@ def uniform(key: Int[Tensor, " n"], step: Int[Tensor, " n"], size: int) -> Float
     return (_mixed((rows[:, None] + column) & WORD) >> 8).float() / 2**24
 
 
-class Disturbances:
+class Perturbations:
     """Noise, delay and pushes of n environments.
 
     Args:
@@ -51,7 +51,7 @@ class Disturbances:
         device: where the tensors are.
     """
 
-    def __init__(self, preset: Preset, num_envs: int, action_size: int, frequency: int, device: torch.device):
+    def __init__(self, preset: Randomisation, num_envs: int, action_size: int, frequency: int, device: torch.device):
         self.preset, self._frequency = preset, frequency
         self.buffers = {
             "key": torch.zeros(num_envs, device=device),
@@ -84,19 +84,19 @@ class Disturbances:
         angle = 2 * pi * where
         return torch.stack([size * angle.cos(), size * angle.sin(), torch.zeros_like(size)], -1)
 
-    def seen(self, s: S, choice: Choice, step: Int[Tensor, " n"]) -> S:
+    def observed(self, s: S, choice: Choice, step: Int[Tensor, " n"]) -> S:
         """The state as it is observed: object pose, all that follows from it, and hand joints are noisy."""
         preset = self.preset
         if not preset.noisy:
             return s
         error = 2 * self._draws(step, 0, SENSOR_DRAWS) - 1
-        position = s.object_p + preset.seen_position * error[:, :3]
-        tilt = quaternion_from_rotation_vector(preset.seen_rotation * error[:, 3:6])
+        position = s.object_p + preset.observed_position * error[:, :3]
+        tilt = quaternion_from_rotation_vector(preset.observed_rotation * error[:, 3:6])
         quaternion = quaternion_multiply(s.object_q, tilt)
         near_p, near_q, approach = choice.goals(position, quaternion)
         return observed(
             s,
-            object_p=position, object_q=quaternion, hand_q=s.hand_q + preset.seen_joint * error[:, 6:],
+            object_p=position, object_q=quaternion, hand_q=s.hand_q + preset.observed_joint * error[:, 6:],
             near_p=near_p, near_q=near_q, goal_p=near_p[:, 0], goal_q=near_q[:, 0], goal_approach=approach,
         )  # fmt: skip
 

@@ -99,7 +99,7 @@ class SimulatorReader:
             object_p=p[:, -1], object_q=q[:, -1], object_v=v[:, -1], object_w=w[:, -1],
             object_half=object_half, start_p=e.start_p.clone(),
             touch=e.touch > 0, force=e.force.clone(), supported=e.supported > 0,
-            penetration=e.penetration.clone(), deepest=e.deepest.clone(),
+            penetration=e.penetration.clone(), max_penetration=e.max_penetration.clone(),
             stage=machine.index.clone(), time=time,
             action=e.action.clone(), previous_action=e.previous_action.clone(),
             goal_p=near_p[:, 0], goal_q=near_q[:, 0], goal_approach=approach, near_p=near_p, near_q=near_q,

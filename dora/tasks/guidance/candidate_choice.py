@@ -11,7 +11,7 @@ from dora.geometry.rotations import (
     quaternion_multiply,
     rotation_angle,
 )
-from dora.tasks.mdp.randomisation import Preset
+from dora.tasks.mdp.randomisation import Randomisation
 
 NEAREST = 3
 """Candidates that an environment observes; the first one leads the reference."""
@@ -87,7 +87,7 @@ class Choice:
 
     def choose(
         self, rows: Int[Tensor, " b"], index: Int[Tensor, "b k"], reachable: Bool[Tensor, " b"],
-        error: Float[Tensor, "b 26"], preset: Preset,
+        error: Float[Tensor, "b 26"], preset: Randomisation,
     ) -> None:  # fmt: skip
         """Gives the environments `rows` the candidates `index`, with the preset's error.
 

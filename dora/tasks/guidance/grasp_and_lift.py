@@ -15,7 +15,7 @@ from dora.errors import InputError
 from dora.geometry.rotations import rotation_angle
 from dora.tasks.guidance.candidate_choice import Choice
 from dora.tasks.guidance.reference import Reference
-from dora.tasks.guidance.residual_action import Correction, Target
+from dora.tasks.guidance.residual_action import ResidualAction, Target
 from dora.tasks.mdp.snapshot import Snapshot
 from dora.tasks.mdp.stages import Stage
 
@@ -167,7 +167,7 @@ class Guide:
         correction: what the action does to the reference.
     """
 
-    def __init__(self, parts: Iterable[str], choice: Choice, reference: Reference, correction: Correction):
+    def __init__(self, parts: Iterable[str], choice: Choice, reference: Reference, correction: ResidualAction):
         self.parts = frozenset(parts)
         self.choice, self.reference, self.correction = choice, reference, correction
 

@@ -44,7 +44,7 @@ class Target:
     hand: Float[Tensor, "n 20"]
 
 
-class Correction:
+class ResidualAction:
     """Per-environment correction in units of the bounds.
 
     Attributes:

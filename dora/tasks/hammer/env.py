@@ -28,7 +28,7 @@ from dora.tasks.hammer.ballistics import Strike, relative
 from dora.tasks.hammer.nail import Nail
 from dora.tasks.hammer.reach import with_waiting_hand, within_reach
 from dora.tasks.hammer.reference import CatchReference
-from dora.tasks.hammer.rewards import DEEPEST, PAPER_TERMS, STAGES, TERMS
+from dora.tasks.hammer.rewards import PAPER_TERMS, PENETRATION_LIMIT, STAGES, TERMS
 from dora.tasks.hammer.snapshot import (
     HammerSnapshot,
     face_to_nail,
@@ -126,7 +126,7 @@ class HammerEnv(DoraEnv):
     EXTRA_OBSERVATIONS = OBSERVATIONS
     DRAWS = 9
     MAX_STEPS = 320
-    DEEPEST = DEEPEST
+    PENETRATION_LIMIT = PENETRATION_LIMIT
     CONTROL_FREQUENCY = 40
     PHYSICS_FREQUENCY = 240
     SOLVER_ITERATIONS = 8

@@ -41,7 +41,7 @@ HOLD = 10
 """Control steps the hammer must be held over the nail."""
 DROPPED = 0.12
 """Distance of the handle from the middle of the grip at which the hammer is lost [m]."""
-DEEPEST = 0.005
+PENETRATION_LIMIT = 0.005
 """Penetration above which an episode does not count as a success [m]."""
 AFTER_OVERLAP = 0.3
 """Share of what blows earn that is left once an overlap was deeper than that."""
@@ -108,7 +108,7 @@ def _kept(s: HammerSnapshot) -> Tensor:
 
 
 def _clean(s: HammerSnapshot) -> Tensor:
-    return (s.deepest <= DEEPEST).float()
+    return (s.max_penetration <= PENETRATION_LIMIT).float()
 
 
 def _strike(s: HammerSnapshot) -> Tensor:
@@ -148,7 +148,7 @@ TERMS: Terms[HammerSnapshot] = Terms(
             doc=f"depth driven by blows, saturating at the target; {AFTER_OVERLAP:g} of it after an overlap above 5 mm",
         ),
         "driven": Term(_driven, 1.5, doc="all stages done, and no overlap above 5 mm so far"),
-        **penalties(0.001, DEEPEST),
+        **penalties(0.001, PENETRATION_LIMIT),
     }
 )
 

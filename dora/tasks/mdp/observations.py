@@ -85,7 +85,9 @@ OBSERVATIONS: dict[str, Entry] = {
     "object_w": Entry(_object_spin, "rad/s", f"object spin in the hand's axes, clipped at {FASTEST_SPIN:g}"),
     "object_rise": Entry(lambda s: lifted(s)[:, None], "m", "height of the object above its start"),
     "touch": Entry(lambda s: s.touch.float(), "1", "contact of thumb, index, middle, ring, pinky, palm"),
-    "deepest": Entry(lambda s: s.deepest[:, None] * 1000, "mm", "deepest penetration of the episode so far"),
+    "max_penetration": Entry(
+        lambda s: s.max_penetration[:, None] * 1000, "mm", "deepest penetration of the episode so far"
+    ),
     "stage": Entry(lambda s: s.stage[:, None].float(), "1", "index of the active stage"),
     "time": Entry(lambda s: s.time[:, None], "1", "share of the episode that is over"),
     "goal": Entry(

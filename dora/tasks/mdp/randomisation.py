@@ -6,8 +6,8 @@ from dora.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Preset:
-    """Half widths of uniform errors, ranges of what is drawn anew, and disturbances; all zero by default.
+class Randomisation:
+    """Half widths of uniform errors, ranges of what is drawn anew, and perturbations; all zero by default.
 
     Attributes:
         name: the preset's name.
@@ -17,10 +17,10 @@ class Preset:
         candidate_position: half width of the error of a candidate's wrist position along each axis [m].
         candidate_rotation: half width of the error of a candidate's orientation about each axis [rad].
         candidate_joint: half width of the error of a candidate's finger joints [rad].
-        seen_position: half width of the error of the observed object position along each axis [m]; drawn every
+        observed_position: half width of the error of the observed object position along each axis [m]; drawn every
             control step.
-        seen_rotation: half width of the error of the observed object orientation about each axis [rad]; the same.
-        seen_joint: half width of the error of the observed hand joints [rad]; the same.
+        observed_rotation: half width of the error of the observed object orientation about each axis [rad]; the same.
+        observed_joint: half width of the error of the observed hand joints [rad]; the same.
         delay: control steps after which an action takes effect.
         push: impulse of a push on the object in a random horizontal direction [N s].
         push_rate: mean number of pushes in a second [1/s].
@@ -33,9 +33,9 @@ class Preset:
     candidate_position: float = 0.0
     candidate_rotation: float = 0.0
     candidate_joint: float = 0.0
-    seen_position: float = 0.0
-    seen_rotation: float = 0.0
-    seen_joint: float = 0.0
+    observed_position: float = 0.0
+    observed_rotation: float = 0.0
+    observed_joint: float = 0.0
     delay: int = 0
     push: float = 0.0
     push_rate: float = 0.0
@@ -43,14 +43,14 @@ class Preset:
     @property
     def noisy(self) -> bool:
         """Whether anything that is observed differs from the truth."""
-        return max(self.seen_position, self.seen_rotation, self.seen_joint) > 0
+        return max(self.observed_position, self.observed_rotation, self.observed_joint) > 0
 
 
 PRESETS = {
     p.name: p
     for p in (
-        Preset(name="none"),
-        Preset(
+        Randomisation(name="none"),
+        Randomisation(
             name="standard",
             size=0.08,
             mass=0.3,
@@ -58,11 +58,11 @@ PRESETS = {
             candidate_position=0.008,
             candidate_rotation=0.08,
             candidate_joint=0.08,
-            seen_position=0.002,
-            seen_rotation=0.02,
-            seen_joint=0.01,
+            observed_position=0.002,
+            observed_rotation=0.02,
+            observed_joint=0.01,
         ),
-        Preset(
+        Randomisation(
             name="hard",
             size=0.12,
             mass=0.5,
@@ -70,9 +70,9 @@ PRESETS = {
             candidate_position=0.015,
             candidate_rotation=0.15,
             candidate_joint=0.10,
-            seen_position=0.005,
-            seen_rotation=0.05,
-            seen_joint=0.02,
+            observed_position=0.005,
+            observed_rotation=0.05,
+            observed_joint=0.02,
             delay=1,
             push=0.05,
             push_rate=0.5,
@@ -81,7 +81,7 @@ PRESETS = {
 }
 
 
-def find_preset(name: str) -> Preset:
+def find_preset(name: str) -> Randomisation:
     """The preset called `name`; raises InputError for an unknown one."""
     if name not in PRESETS:
         raise InputError(f"unknown preset {name!r}; choose one of {', '.join(PRESETS)}")

@@ -47,7 +47,7 @@ class Snapshot:
         force: magnitude of those contacts' forces [N].
         supported: the object touches the world (table, stand).
         penetration: deepest overlap of hand and object, or of either with the world, now [m].
-        deepest: the same, maximum over the episode [m].
+        max_penetration: the same, maximum over the episode [m].
         stage: index of the active stage; the number of stages when all are done.
         time: share of the episode that is over, 0 to 1.
         action, previous_action: last two actions, as given.
@@ -81,7 +81,7 @@ class Snapshot:
     force: Float[Tensor, "n 6"]
     supported: Bool[Tensor, " n"]
     penetration: Float[Tensor, " n"]
-    deepest: Float[Tensor, " n"]
+    max_penetration: Float[Tensor, " n"]
     stage: Int[Tensor, " n"]
     time: Float[Tensor, " n"]
     action: Float[Tensor, "n a"]
