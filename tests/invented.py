@@ -1,42 +1,88 @@
 """Invented snapshots: task logic is tested on states that no simulator has made."""
 
 from dataclasses import fields
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from dora.tasks.mdp.snapshot import Snapshot
+from dora.tasks.mdp.memory import EpisodeMemory, HandSizes
+from dora.tasks.mdp.snapshot import GoalState, HandState, ObjectState, S, Snapshot, extended
 
-SIZES = {
-    "arm_q": 7, "hand_q": 20, "hand_v": 20, "hand_target": 20, "wrist_q": 4, "object_q": 4, "goal_q": 4,
-    "touch": 6, "force": 6, "action": 26, "previous_action": 26, "correction": 26,
-    "goal_pregrasp": 20, "goal_grasp": 20, "contact_finger": 0,
+ARM, FINGERS, HAND, ACTION, NEAR = 7, 5, 20, 26, 3
+"""Joints of the arm, fingers, joints of the hand, components of the action, candidates that are observed."""
+HAND_SHAPES: dict[str, tuple[int, ...]] = {
+    "arm_q": (ARM,), "q": (HAND,), "v": (HAND,), "target": (HAND,), "wrist_p": (3,), "wrist_q": (4,), "wrist_v": (3,),
+    "wrist_w": (3,), "tip_p": (FINGERS, 3), "tip_q": (FINGERS, 4), "touch": (FINGERS + 1,), "force": (FINGERS + 1,),
+    "contact_p": (0, 3), "contact_finger": (0,),
 }  # fmt: skip
-SCALARS = ("supported", "penetration", "max_penetration", "stage", "time")
+OBJECT_SHAPES: dict[str, tuple[int, ...]] = {
+    "p": (3,), "q": (4,), "v": (3,), "w": (3,), "half": (3,), "start_p": (3,), "supported": (),
+}  # fmt: skip
+GOAL_SHAPES: dict[str, tuple[int, ...]] = {
+    "p": (3,), "q": (4,), "approach": (3,), "pregrasp": (HAND,), "grasp": (HAND,), "near_p": (NEAR, 3),
+    "near_q": (NEAR, 4), "phase": (4,), "residual": (ACTION,),
+}  # fmt: skip
+SHARED_SHAPES: dict[str, tuple[int, ...]] = {
+    "penetration": (), "max_penetration": (), "stage": (), "time": (),
+    "action": (ACTION,), "previous_action": (ACTION,),
+}  # fmt: skip
+QUATERNIONS = ("q", "wrist_q", "tip_q", "near_q")
+"""Fields that are unit quaternions, where their last axis has four components."""
+KINDS = {"touch": torch.bool, "supported": torch.bool, "stage": torch.long, "contact_finger": torch.long}
+"""Fields that are no floats."""
+TIP_RADIUS = 0.011
+"""Radius of invented fingertips [m]."""
 
 
-def zeros(kind: type[Snapshot], n: int, phases: int = 4, scalars: tuple[str, ...] = ()) -> dict[str, Tensor]:
-    """Fields of a snapshot of n environments: zeros and unit quaternions.
-
-    Args:
-        kind: class of the snapshot.
-        n: environments.
-        phases: of the reference.
-        scalars: fields (n,) of `kind` beyond those of `Snapshot`.
-    """
-    values: dict[str, Tensor] = {}
-    sizes = SIZES | {"phase": phases}
-    for f in fields(kind):
-        shape = (n,) if f.name in (*SCALARS, *scalars) else (n, sizes.get(f.name, 3))
-        values[f.name] = torch.zeros(shape)
-        if f.name.endswith("_q") and sizes.get(f.name) == 4:
-            values[f.name][:, 0] = 1.0
-    values |= {"tip_p": torch.zeros(n, 5, 3), "tip_q": torch.tensor([1.0, 0, 0, 0]).repeat(n, 5, 1)}
-    values |= {"near_p": torch.zeros(n, 3, 3), "near_q": values["tip_q"][:, :3], "contact_p": torch.zeros(n, 0, 3)}
-    values |= {k: values[k].bool() for k in ("touch", "supported")}
-    return values | {k: values[k].long() for k in ("stage", "contact_finger")}
+def record(kind: Any, shapes: dict[str, tuple[int, ...]], n: int, given: dict[str, Any]) -> Any:
+    """A record of zeros and unit quaternions, with what is given."""
+    values: dict[str, Any] = {}
+    for name, shape in shapes.items():
+        values[name] = torch.zeros(n, *shape, dtype=KINDS.get(name, torch.float32))
+        if name in QUATERNIONS and shape[-1] == 4:
+            values[name][..., 0] = 1.0
+    return kind(**(values | given))
 
 
 def invented(n: int, **given: Tensor) -> Snapshot:
-    """A snapshot of zeros, unit quaternions and boxes of half extents 3 cm, with what is given."""
-    return Snapshot(**(zeros(Snapshot, n) | {"object_half": torch.full((n, 3), 0.03)} | given))
+    """A snapshot of one arm and one object: zeros, unit quaternions, boxes of half extents 3 cm, with what is given.
+
+    Fields of the hand are named as in `HandState`, or `hand_q`, `hand_v`; those of the object `object_p`, ...,
+    `start_p`, `supported`; those of the goal `goal_p`, ..., `near_p`, `near_q`, `phase`, `residual`.
+    """
+    hand: dict[str, Any] = {"tip_radius": TIP_RADIUS}
+    body: dict[str, Any] = {"half": torch.full((n, 3), 0.03)}
+    goal: dict[str, Any] = {}
+    shared: dict[str, Any] = {}
+    own = [(hand, HAND_SHAPES), (body, OBJECT_SHAPES), (goal, GOAL_SHAPES), (shared, SHARED_SHAPES)]
+    for name, value in given.items():
+        whose, _, short = name.partition("_")
+        named = {"object": body, "goal": goal, "hand": hand}
+        if whose in named:
+            named[whose][short] = value
+        else:
+            next(place for place, shapes in own if name in shapes)[name] = value
+    records = {
+        "hands": {"arm": record(HandState, HAND_SHAPES, n, hand)},
+        "objects": {"thing": record(ObjectState, OBJECT_SHAPES, n, body)},
+        "goals": {"arm": record(GoalState, GOAL_SHAPES, n, goal)},
+        "handles": {"arm": "thing"},
+    }
+    return record(Snapshot, SHARED_SHAPES, n, records | shared)
+
+
+def extension(kind: type[S], n: int, **given: Tensor) -> S:
+    """An invented snapshot of a subclass, whose own fields are all given."""
+    own = {f.name for f in fields(kind)} - {f.name for f in fields(Snapshot)}
+    s = invented(n, **{name: value for name, value in given.items() if name not in own})
+    return extended(s, kind, **{name: value for name, value in given.items() if name in own})
+
+
+def memory(n: int, **given: Tensor) -> EpisodeMemory:
+    """Memory of an episode of one arm and one object, zero but for what is given of the object or the episode."""
+    made = EpisodeMemory(n, ACTION, {"arm": HandSizes(FINGERS + 1, 0)}, ("thing",), "cpu")
+    for name, value in given.items():
+        part = made.object if name in made.object else made.episode
+        part.update(**{name: value})
+    return made

@@ -1,20 +1,34 @@
 """The run command refuses bad input with one sentence and exit status 2."""
 
+import dataclasses
 import json
+import re
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
+import yaml
 from commands import call, load_command
 
+import dora.agents
 from dora.agents.checkpoint import read_checkpoint
 from dora.agents.config import LEARNER_CONFIGS
 from dora.agents.evaluation.play import load_policy
-from dora.agents.runs.presets import PRESETS, recommended
+from dora.agents.runs.recommended import recommended
 from dora.agents.runs.run_folder import RunFolder
+from dora.commands import run
+from dora.configs import plain
+from dora.errors import InputError
+from dora.tasks import find_task, make_task
+from dora.tasks.cube import CubeConfig
+from dora.tasks.env.options import task_config
+from dora.tasks.mdp.randomisation import PRESETS
 
 SHIPPED = sorted((Path(__file__).parents[1] / "results").rglob("policy.safetensors"))
 """Policies of the results that the README shows."""
+FIRST = Path(dora.agents.__file__).parent / "first_numbers.yaml"
+"""Numbers of runs whose settings hold none."""
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +45,8 @@ def script() -> ModuleType:
         ("--env DoraCube-v1 --num-envs 0", "--num-envs is 0"),
         ("--env DoraCube-v1 --total-steps -5", "--total-steps is -5"),
         ("--env DoraCube-v1 --workers -1", "--workers is -1"),
-        ("--env DoraCube-v1 --noise-correlation 1", "--noise-correlation is 1.0"),
-        ("--env DoraCube-v1 --agent mappo", "two arms"),
+        ("--env DoraCube-v1 --learner.noise-correlation 1", "--learner.noise-correlation is 1.0"),
+        ("--env DoraCube-v1 --agent mappo", "use --agent with one of ppo, sac"),
         ("--resume /nowhere", "not a run folder"),
         ("--eval-only", "--checkpoint"),
         ("--eval-only --checkpoint /nowhere.safetensors", "no checkpoint"),
@@ -53,7 +67,7 @@ def test_bad_input(
     assert captured.out == ""
 
 
-@pytest.mark.parametrize("arguments", ["--agent foo", "--no-such-option 1"])
+@pytest.mark.parametrize("arguments", ["--env DoraCube-v1 --seed x", "--env DoraCube-v1 --no-such-option 1"])
 def test_errors_of_the_parser(script: ModuleType, monkeypatch: pytest.MonkeyPatch, arguments: str):
     with pytest.raises(SystemExit) as exit_info:
         call(script, monkeypatch, *arguments.split())
@@ -69,12 +83,73 @@ def test_resume_refuses_another_task(
 
 
 def test_a_bare_command_takes_the_learner_recommended_for_the_task():
-    chosen = {env: recommended(env) for env in ("DoraCube-v1", "DoraJug-v1", "DoraHammer-v1", "PickCube-v1")}
-    assert [config.agent for config in chosen.values()] == ["ppo", "sac", "sac", "ppo"]
-    for config in chosen.values():
+    chosen = {env: run.parse(["--env", env]).run for env in ("DoraCube-v1", "DoraJug-v1", "DoraHammer-v1")}
+    assert [config.agent for config in chosen.values()] == ["ppo", "sac", "sac"]
+    for env, config in chosen.items():
         assert isinstance(config.learner, LEARNER_CONFIGS[config.agent])
-    assert chosen["DoraJug-v1"].total_steps == PRESETS["DoraJug-v1", "sac"]["total_steps"]
-    assert recommended("DoraJug-v1", "ppo").agent == "ppo"
+        assert config.total_steps == find_task(env).LEARNERS[config.agent]["total_steps"]
+    assert run.parse(["--env", "DoraJug-v1", "--agent", "ppo"]).run.agent == "ppo"
+    assert recommended("PickCube-v1").agent == "ppo"
+
+
+def test_every_number_of_task_and_learner_is_an_option():
+    words = "--env DoraCube-v1 --preset hard --task.lift 0.12 --task.weights.lift 2 --learner.gamma 0.9"
+    config = run.parse([*words.split(), "--task.randomisation.push", "0.1"]).run
+    assert (config.task["lift"], config.task["weights"]["lift"], config.learner.gamma) == (0.12, 2.0, 0.9)
+    assert config.task["randomisation"] == plain(PRESETS["hard"]) | {"push": 0.1}
+    assert config.digest() != run.parse(["--env", "DoraCube-v1"]).run.digest()
+    task = make_task("DoraCube-v1", 1, **config.task_options)
+    assert isinstance(task.config, CubeConfig)
+    assert (task.config.lift, task.terms.terms["lift"].weight, task.config.randomisation.push) == (0.12, 2.0, 0.1)
+    task.close()
+
+
+@pytest.mark.parametrize("words", ["", "--env DoraCube-v1", "--env DoraJug-v1 --agent ppo"])
+def test_help_shows_the_defaults_of_the_chosen_task(words: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        run.parse([*words.split(), "--help"])
+    shown = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    env = words.split()[1] if words else run.SHOWN
+    learners = find_task(env).LEARNERS
+    agent = words.split()[3] if "--agent" in words else next(iter(learners))
+    assert f"(default: {env})" in shown
+    budget = "--total-steps INT Budget in environment steps, summed over all environments."
+    assert f"{budget} (default: {learners[agent]['total_steps']})" in shown
+    assert "mappo" not in shown
+    assert "--task.weights.penetration" in shown
+
+
+def test_a_run_goes_on_with_the_numbers_of_its_folder(tmp_path: Path):
+    config = run.parse(["--env", "DoraCube-v1", "--task.lift", "0.12", "--learner.gamma", "0.9"]).run
+    RunFolder(tmp_path).create(config)
+    again = run.parse(["--resume", str(tmp_path), "--total-steps", "7"]).run
+    assert again == dataclasses.replace(config, total_steps=7)
+    run.refuse_other_settings(tmp_path, config, again)
+    other = run.parse(["--resume", str(tmp_path), "--task.lift", "0.1"]).run
+    with pytest.raises(InputError, match="has task"):
+        run.refuse_other_settings(tmp_path, config, other)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"lerner": {}}, "lerner"),
+        ({"seed": "zero"}, "seed must be int, not 'zero'"),
+        ({"learner": {"gama": 0.9}}, "did you mean 'gamma'"),
+        ({"learner": {"gamma": "high"}}, "gamma must be float"),
+        ({"agent": "dqn"}, "learner 'dqn'"),
+        ({"task": [1]}, "mapping"),
+        ({"task": {"lifd": 0.1}}, "did you mean 'lift'"),
+        ({"task": {"lift": "high"}}, "lift must be float"),
+    ],
+)
+def test_settings_of_a_folder_are_checked(tmp_path: Path, change: dict[str, Any], words: str):
+    folder = RunFolder(tmp_path)
+    folder.create(run.parse(["--env", "DoraCube-v1"]).run)
+    content = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(content | change))
+    with pytest.raises(InputError, match=words):
+        run.parse(["--resume", str(tmp_path)])
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parts[-3]}/{path.parts[-2]}")
@@ -82,8 +157,17 @@ def test_a_shipped_policy_is_that_of_the_result_beside_it(path: Path):
     checkpoint, result = read_checkpoint(path), json.loads((path.parent / "result.json").read_text())
     load_policy(checkpoint, path)
     assert (checkpoint.config.env, checkpoint.config.seed) == (result["env"], result["seed"])
-    assert checkpoint.config.task.get("preset") == result.get("task", {}).get("preset")
-    assert checkpoint.config.digest() == result["config_digest"]
+    assert checkpoint.config.preset == result.get("task", {}).get("preset", "standard")
+    assert checkpoint.config_digest == result["config_digest"]
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parts[-3]}/{path.parts[-2]}")
+def test_policies_of_versions_without_numbers_mean_the_numbers_of_then(path: Path):
+    config = read_checkpoint(path).config
+    task = find_task(config.env).CONFIG
+    first = yaml.safe_load(FIRST.read_text())
+    assert config.task == first["tasks"][config.env] | {"randomisation": first["presets"][config.preset]}
+    task_config(task, config.preset, config.task)  # every name is known
 
 
 def test_a_shipped_policy_can_be_evaluated_alone(
@@ -97,5 +181,5 @@ def test_a_shipped_policy_can_be_evaluated_alone(
     assert "evaluation on 4 episodes" in captured.err
     assert "success 1.000, without any correction 1.000" in captured.err
     result = json.loads((tmp_path / "eval" / "result.json").read_text())
-    assert (result["success_rate"], result["eval_episodes"], result["task"]) == (1.0, 4, {"preset": "none"})
+    assert (result["success_rate"], result["eval_episodes"], result["preset"]) == (1.0, 4, "none")
     assert result["workers"] == 1

@@ -7,7 +7,7 @@ from torch import Tensor
 from dora.agents.config import SACConfig
 from dora.agents.learners.networks import TanhActor
 from dora.agents.learners.sac import SAC, multi_step
-from dora.agents.runs.presets import recommended
+from dora.agents.runs.recommended import recommended
 
 ROWS, LENGTH, OBSERVATION, ACTION = 4, 16, 3, 2
 GAMMA = 0.9
@@ -118,6 +118,5 @@ def test_only_guided_runs_are_pulled_to_the_prior():
     prior = {name: recommended("DoraCube-v1", "sac", guidance=name).learner for name in ("affordance", "none")}
     assert prior["affordance"] == SACConfig()
     assert prior["none"] == SACConfig(prior=0.0)
-    observed = {"guidance_parts": ["observation"]}
-    assert recommended("DoraCube-v1", "sac", task=observed).learner == SACConfig(prior=0.0)
+    assert recommended("DoraCube-v1", "sac", guidance_parts=("observation",)).learner == SACConfig(prior=0.0)
     assert recommended("DoraCube-v1", "sac", guidance="none", learner={"prior": 0.2}).learner == SACConfig(prior=0.2)

@@ -9,7 +9,7 @@ import torch
 import dora.tasks as tasks
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
 from dora.sim.controllers import LIMIT_MARGIN
-from dora.tasks.env.base import DoraEnv
+from dora.tasks.env.env import DoraEnv
 from dora.tasks.guidance.residual_action import wrist_step
 
 PATH_STEPS = 60
@@ -27,24 +27,24 @@ def task() -> Iterator[DoraEnv]:
 
 
 def command(task: DoraEnv, wrist: torch.Tensor) -> torch.Tensor:
-    hand = task.agent.wrist_controller.hand_action(task.snapshot.hand_target)
+    hand = task.agent.wrist_controller.hand_action(task.snapshot.hand.target)
     return torch.cat([wrist, hand], -1)
 
 
 def test_the_wrist_follows_a_path(task: DoraEnv, record_property):
     task.reset(seed=0)
-    start_p, start_q = task.snapshot.wrist_p.clone(), task.snapshot.wrist_q.clone()
+    start_p, start_q = task.snapshot.hand.wrist_p.clone(), task.snapshot.hand.wrist_q.clone()
     controller, shifts, turns = task.agent.wrist_controller, [], []
     for t in range(PATH_STEPS + 8):
         phase = torch.tensor(2 * pi * min(t, PATH_STEPS) / PATH_STEPS)
         goal_p = start_p + PATH_RADIUS * torch.stack([phase.cos() - 1, phase.sin(), phase.sin() / 2])
         tilt = torch.stack([phase.sin(), torch.zeros(()), 1 - phase.cos()]) * PATH_TILT
         goal_q = quaternion_multiply(quaternion_from_rotation_vector(tilt).expand(4, 4), start_q)
-        step = wrist_step(goal_p, goal_q, *controller.wrist(), controller.wrist_limits)
+        step = wrist_step(goal_p, goal_q, *controller.wrist(), limits=controller.wrist_limits)
         task.step(command(task, step))
         s = task.snapshot
-        shifts.append((s.wrist_p - goal_p).norm(dim=-1).max() * 1000)
-        turns.append(torch.rad2deg(rotation_angle(s.wrist_q, goal_q).max()))
+        shifts.append((s.hand.wrist_p - goal_p).norm(dim=-1).max() * 1000)
+        turns.append(torch.rad2deg(rotation_angle(s.hand.wrist_q, goal_q).max()))
     shift, turn = torch.stack(shifts), torch.stack(turns)
     record_property("tracking", f"moving {shift.max():.1f} mm {turn.max():.1f} deg, at rest {shift[-1]:.2f} mm")
     print(f"tracking: moving {shift.max():.1f} mm, {turn.max():.1f} deg; rest {shift[-1]:.2f} mm, {turn[-1]:.2f} deg")
@@ -61,7 +61,7 @@ def test_out_of_reach_and_singular_poses_stay_finite_and_within_limits(task: Dor
     push = torch.zeros(4, 6)
     push[:, direction] = torch.tensor([1.0, -1.0, 1.0, -1.0])
     push[2:, 3 + direction] = 1.0
-    speed = torch.tensor(arm.velocity, dtype=torch.float32) / task.CONTROL_FREQUENCY
+    speed = torch.tensor(arm.velocity, dtype=torch.float32) / task.config.control_frequency
     for _ in range(70):
         before = controller.target[:, :7].clone()
         task.step(command(task, push))
@@ -71,7 +71,7 @@ def test_out_of_reach_and_singular_poses_stay_finite_and_within_limits(task: Dor
     lower, upper = (torch.tensor(x, dtype=torch.float32) for x in (arm.lower, arm.upper))
     assert (controller.target[:, :7] >= lower + LIMIT_MARGIN - 1e-5).all()
     assert (controller.target[:, :7] <= upper - LIMIT_MARGIN + 1e-5).all()
-    assert torch.isfinite(task.snapshot.arm_q).all()
+    assert torch.isfinite(task.snapshot.hand.arm_q).all()
 
 
 def test_hand_targets_reach_what_was_asked_no_faster_than_allowed(task: DoraEnv):
@@ -79,7 +79,7 @@ def test_hand_targets_reach_what_was_asked_no_faster_than_allowed(task: DoraEnv)
     controller, hand = task.agent.wrist_controller, task.agent.description.hand
     action = torch.zeros(4, task.action_size)
     action[:, 6:] = 1.0
-    limit = torch.tensor(hand.velocity, dtype=torch.float32) / task.CONTROL_FREQUENCY
+    limit = torch.tensor(hand.velocity, dtype=torch.float32) / task.config.control_frequency
     for _ in range(12):
         before = controller.target[:, 7:].clone()
         task.step(action)

@@ -35,7 +35,7 @@ def test_successes_are_recorded_and_can_be_played_again(tmp_path: Path):
     for action in torch.from_numpy(actions):
         *_, info = task.step(action[None])
     assert info["success"].all()
-    np.testing.assert_allclose(task.snapshot.object_p[0].numpy(), poses[-1, :3], atol=0.01)
+    np.testing.assert_allclose(task.snapshot.object.p[0].numpy(), poses[-1, :3], atol=0.01)
     task.close()
 
 

@@ -75,7 +75,7 @@ def test_the_hands_digest_is_the_one_that_the_bundled_grasps_have():
 @pytest.mark.parametrize("env_id", ["DoraCube-v1", "DoraJug-v1"])
 def test_bundled_tables_of_feasibility_are_found(env_id: str):
     task = make_task(env_id, 1)
-    table = task.reach_table
+    table = task.arm.reach_table
     task.close()
     assert table is not None
     assert (data_folder() / f"reach-{table.digest[:16]}.safetensors").is_file()

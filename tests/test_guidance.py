@@ -10,10 +10,11 @@ import dora.tasks as tasks
 from dora.affordance.candidates import GraspCandidates
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector
-from dora.tasks.env.perturbations import SENSOR_DRAWS, Perturbations, uniform
-from dora.tasks.guidance.candidate_choice import Choice
-from dora.tasks.guidance.grasp_and_lift import DESCEND, STANDOFF, GraspReference
-from dora.tasks.guidance.residual_action import SMOOTHING, Bounds, ResidualAction, Target
+from dora.tasks.env.perturbations import Perturbations, uniform
+from dora.tasks.guidance.candidate_choice import CandidateChoice
+from dora.tasks.guidance.grasp_and_lift import DESCEND, GraspReference, GraspSettings
+from dora.tasks.guidance.residual_action import SMOOTHING, ResidualAction, Target
+from dora.tasks.mdp.config import ResidualBounds
 from dora.tasks.mdp.guidance_parts import PARTS
 from dora.tasks.mdp.randomisation import PRESETS, Randomisation
 
@@ -35,7 +36,7 @@ def along_x(*x: float, score: tuple[float, ...] | None = None) -> GraspCandidate
 
 
 def nearest(candidates: GraspCandidates, reachable: list[bool], wrist_x: float = 0.0) -> list[int]:
-    choice, zero = Choice(candidates, 1, CPU), torch.zeros(1, 3)
+    choice, zero = CandidateChoice(candidates, 1, CPU), torch.zeros(1, 3)
     wrist = torch.tensor([[wrist_x, 0.0, 0.0]])
     return choice.nearest(zero, IDENTITY, wrist, IDENTITY, torch.tensor([reachable])).tolist()[0]
 
@@ -57,23 +58,23 @@ def test_well_ranked_candidates_come_first():
 def test_candidate_errors_are_bounded_and_follow_the_share():
     candidates, preset = along_x(0.1, 0.2, 0.3), PRESETS["hard"]
     n = 500
-    choice = Choice(candidates, n, CPU)
+    choice = CandidateChoice(candidates, n, CPU)
     error = 2 * torch.rand(n, 26, generator=torch.Generator().manual_seed(0)) - 1
     index = torch.arange(3).repeat(n, 1)
     rows, able = torch.arange(n), torch.ones(n, dtype=torch.bool)
     choice.choose(rows, index, able, error, preset)
-    off = choice.buffers["position"] - candidates.position
+    off = choice.buffers.position - candidates.position
     assert off.abs().max() <= preset.candidate_position
     assert off.std(0).min() > 0.4 * preset.candidate_position
     torch.testing.assert_close(off[:, 0], off[:, 1], atol=1e-6, rtol=0)  # one error for all of an environment
     choice.error_scale = 0.5
     choice.choose(rows, index, able, error, preset)
-    half = choice.buffers["position"] - candidates.position
+    half = choice.buffers.position - candidates.position
     torch.testing.assert_close(half, off / 2, atol=1e-6, rtol=0)
 
 
 def test_corrections_are_low_passed_bounded_and_in_the_hand_frame():
-    bounds = Bounds(position=0.02, rotation=0.1, joint=0.2)
+    bounds = ResidualBounds(position=0.02, rotation=0.1, joint=0.2)
     correction = ResidualAction(1, 26, bounds, CPU)
     quarter = torch.tensor([[0.5**0.5, 0.0, 0.0, 0.5**0.5]])  # hand x is world y
     target = Target(torch.zeros(1, 3), quarter, torch.zeros(1, 20))
@@ -100,10 +101,10 @@ def test_the_hand_stays_higher_until_it_has_turned():
         3, wrist_q=quaternion_from_rotation_vector(turn), goal_p=goal_p, goal_approach=-torch.eye(3)[[2, 2, 2]]
     )
     for hover, rise in ((0.0, [0.0, 0.0, 0.0]), (0.06, [0.0, 0.03, 0.06])):
-        reference = GraspReference(3, CPU, hover)
-        reference.begin(torch.arange(3), goal_p, s.wrist_q)
+        reference = GraspReference(3, 0.05, CPU, GraspSettings(hover=hover))
+        reference.begin(torch.arange(3), goal_p, s.hand.wrist_q)
         expected = goal_p.clone()
-        expected[:, 2] += STANDOFF + torch.tensor(rise)
+        expected[:, 2] += GraspSettings().standoff + torch.tensor(rise)
         torch.testing.assert_close(reference.target(s).wrist_p, expected)
         reference.phase.index.fill_(DESCEND)
         assert (reference.target(s).wrist_p[:, 2] == expected[0, 2]).all()
@@ -127,47 +128,46 @@ def test_noise_is_a_function_of_key_and_step_and_looks_uniform():
 
 def test_what_is_seen_is_noisy_within_the_preset_and_the_truth_is_kept():
     preset, n = PRESETS["standard"], 300
-    noise = Perturbations(preset, n, 26, 20, CPU)
+    noise = Perturbations(preset, n, 26, {"arm": 20}, 0.05, CPU)
     noise.begin(torch.arange(n), torch.rand(n, generator=torch.Generator().manual_seed(0)))
-    choice = Choice(along_x(0.1), n, CPU)
+    choice = CandidateChoice(along_x(0.1), n, CPU)
     s = invented(n)
-    seen = noise.observed(s, choice, torch.zeros(n, dtype=torch.long))
-    assert seen.object_p.abs().max() <= preset.observed_position
-    assert seen.object_p.std() > 0.4 * preset.observed_position
-    assert 0 < seen.hand_q.abs().max() <= preset.observed_joint
-    assert torch.equal(s.object_p, torch.zeros(n, 3))
-    assert torch.equal(s.hand_q, torch.zeros(n, 20))
-    torch.testing.assert_close(seen.goal_p, choice.goals(seen.object_p, seen.object_q)[0][:, 0])
-    assert torch.equal(seen.touch, s.touch)
-    clear = Perturbations(PRESETS["none"], n, 26, 20, CPU)
-    assert clear.observed(s, choice, torch.zeros(n, dtype=torch.long)) is s
+    seen = noise.observed(s, {"arm": choice}, torch.zeros(n, dtype=torch.long))
+    assert seen.object.p.abs().max() <= preset.observed_position
+    assert seen.object.p.std() > 0.4 * preset.observed_position
+    assert 0 < seen.hand.q.abs().max() <= preset.observed_joint
+    assert torch.equal(s.object.p, torch.zeros(n, 3))
+    assert torch.equal(s.hand.q, torch.zeros(n, 20))
+    torch.testing.assert_close(seen.goal.p, choice.goals(seen.object.p, seen.object.q)[0][:, 0])
+    assert torch.equal(seen.hand.touch, s.hand.touch)
+    clear = Perturbations(PRESETS["none"], n, 26, {"arm": 20}, 0.05, CPU)
+    assert clear.observed(s, {"arm": choice}, torch.zeros(n, dtype=torch.long)) is s
 
 
 def test_delayed_actions_take_effect_later_and_the_first_at_once():
-    late = Perturbations(Randomisation(name="late", delay=2), 1, 1, 20, CPU)
+    late = Perturbations(Randomisation(delay=2), 1, 1, {"arm": 20}, 0.05, CPU)
     done = [late.delayed(torch.tensor([[float(k)]]), torch.tensor([k])).item() for k in range(6)]
     assert done == [0.0, 0.0, 0.0, 1.0, 2.0, 3.0]
 
 
 def test_pushes_come_at_their_rate_with_their_impulse_in_all_directions():
     preset, n, steps = PRESETS["hard"], 100, 200
-    pushes = Perturbations(preset, n, 26, 20, CPU)
+    pushes = Perturbations(preset, n, 26, {"arm": 20}, 0.05, CPU)
     pushes.begin(torch.arange(n), torch.rand(n, generator=torch.Generator().manual_seed(1)))
-    all_steps = torch.stack([pushes.pushes(torch.full((n,), k)) for k in range(steps)]).flatten(0, 1)
+    all_steps = torch.stack([pushes.pushes(torch.full((n,), k))[:, 0] for k in range(steps)]).flatten(0, 1)
     hit = all_steps.norm(dim=-1) > 0
     assert hit.sum() / (n * steps / 20) == pytest.approx(preset.push_rate, rel=0.2)
     torch.testing.assert_close(all_steps[hit].norm(dim=-1), torch.full((int(hit.sum()),), preset.push))
     assert all_steps[hit].mean(0).norm() < 0.2 * preset.push
-    assert SENSOR_DRAWS == 26
 
 
 def test_a_push_moves_the_object_by_impulse_over_mass():
     task = tasks.make_task("DoraCube-v1", 2, preset="none")
     task.reset(seed=0)
-    start = task.snapshot.object_p.clone()
-    task._push(torch.tensor([[0.06, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    start = task.snapshot.object.p.clone()
+    task.task_scene.push(torch.tensor([[[0.06, 0.0, 0.0]], [[0.0, 0.0, 0.0]]]))
     task.step(torch.zeros(2, task.action_size))
-    moved = task.snapshot.object_p - start
+    moved = task.snapshot.object.p - start
     assert moved[0, 0] > 0.005
     assert moved[1].norm() < 1e-3
     task.close()
@@ -180,15 +180,15 @@ def test_each_part_of_guidance_can_be_left_out(missing: str):
     gone = set(whole.observation_entries) - set(task.observation_entries)
     expected = {
         "observation": {"goal", "goal_hand", "near", "surface"},
-        "prior": {"phase", "correction"},
+        "prior": {"phase", "residual"},
     }
     assert gone == expected.get(missing, set())
-    lost = set(whole._terms.terms) - set(task._terms.terms)
+    lost = set(whole.terms.terms) - set(task.terms.terms)
     assert lost == ({"affordance", "candidate"} if missing == "reward" else set())
-    assert task.corrects == (missing != "prior")
+    assert task.arm.corrects == (missing != "prior")
     assert ("unreachable" in task.logged) == (missing != "filter")
     a, b = whole.reset(seed=3), task.reset(seed=3)
-    torch.testing.assert_close(whole.snapshot.object_p, task.snapshot.object_p, atol=0, rtol=0)
+    torch.testing.assert_close(whole.snapshot.object.p, task.snapshot.object.p, atol=0, rtol=0)
     assert len(a[0]) == len(b[0])
     whole.close()
     task.close()
@@ -207,7 +207,7 @@ def test_a_start_without_a_reachable_candidate_fails_and_earns_nothing(parts: tu
     task = tasks.make_task("DoraCube-v1", 3, guidance_parts=parts)
     able = torch.tensor([[True], [False], [True]])
     count = len(task.guide.choice.candidates)
-    task.reachable = lambda p, q: able.repeat_interleave(len(p) // 3, 0).expand(-1, count)  # type: ignore[method-assign]
+    task.task.reachable = lambda arm, p, q: able.repeat_interleave(len(p) // 3, 0).expand(-1, count)
     task.reset(seed=0)
     _, reward, terminated, _, info = task.step(torch.zeros(3, task.action_size))
     filtered = parts is None
@@ -223,7 +223,7 @@ def test_annealed_shares_survive_a_reset():
     task.reset(seed=0)
     task.anneal(bounds=0.25, error=0.5)
     task.reset(seed=1)
-    assert (task.guide.correction.scale, task.guide.choice.error_scale) == (0.25, 0.5)
+    assert (task.guide.residual.scale, task.guide.choice.error_scale) == (0.25, 0.5)
     with pytest.raises(InputError):
         task.anneal(error=2.0)
     task.close()

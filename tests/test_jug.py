@@ -1,19 +1,23 @@
 """DoraJug-v1: its logic on invented states, and what its scripted grasp is worth."""
 
+from dataclasses import replace
 from math import cos, pi, radians, sin
 
 import pytest
 import torch
-from invented import invented
+from invented import TIP_RADIUS, invented, memory
 from torch import Tensor
 
 import dora.tasks as tasks
 from dora.affordance.objects.catalogue import load_object
 from dora.tasks import jug
+from dora.tasks.jug import JugConfig
 from dora.tasks.mdp.snapshot import CONTACT_CLASSES, Snapshot
 
 STARTS = 100
 """Random starts of the scripted grasp."""
+CONFIG = JugConfig()
+"""The task's own numbers."""
 THUMB, INDEX = CONTACT_CLASSES.index("thumb"), CONTACT_CLASSES.index("index")
 
 
@@ -64,7 +68,7 @@ def test_distances_are_those_of_the_handle_and_follow_the_jug():
     matrix = torch.tensor([[cos(1.2), -sin(1.2), 0], [sin(1.2), cos(1.2), 0], [0, 0, 1]])
     moved = tips @ matrix.T + torch.tensor([0.5, 0.1, 0.1])
     s = jugs(1, tip_p=moved[None], object_p=torch.tensor([[0.5, 0.1, 0.1]]), object_q=turn)
-    expected = regions.region_distance(tips, "handle") - jug.TIP_RADIUS
+    expected = regions.region_distance(tips, "handle") - TIP_RADIUS
     torch.testing.assert_close(jug.handle_distance(s)[0], expected, atol=1e-4, rtol=0)
     assert (expected <= 0.0101).all()
 
@@ -74,7 +78,7 @@ def test_only_an_upright_jug_is_held(angle: float, level: bool):
     touch = torch.zeros(1, 6, dtype=torch.bool)
     touch[0, :2] = True
     s = jugs(1, object_p=torch.tensor([[0.0, 0.0, 0.12]]), object_q=tilted(radians(angle)), touch=touch)
-    assert bool(jug.held(s)) == level
+    assert bool(jug.held(s, CONFIG)) == level
 
 
 def test_every_term_stays_in_bounds_on_random_states():
@@ -88,19 +92,19 @@ def test_every_term_stays_in_bounds_on_random_states():
         stage=torch.randint(0, 4, (n,)), contact_p=0.1 * torch.randn(n, 4, 3),
         contact_finger=torch.randint(0, 7, (n, 4)),
     )  # fmt: skip
-    for terms in (jug.TERMS, jug.PAPER_TERMS):
+    for terms in (jug.terms(CONFIG), jug.paper_terms(CONFIG)):
         for name, term in terms.terms.items():
             value = term.value(s)
             assert ((value >= 0) & (value <= 1)).all(), name
 
 
 @pytest.fixture(scope="module")
-def task() -> jug.JugEnv:
+def task() -> tasks.DoraEnv:
     """A batch after its scripted episode, with the stages it went through."""
     task = tasks.make_task("DoraJug-v1", STARTS, preset="none")
-    assert isinstance(task, jug.JugEnv)
+    assert isinstance(task.task, jug.JugTask)
     task.reset(seed=0)
-    turn = task.snapshot.object_q
+    turn = task.snapshot.object.q
     task.yaw = 2 * torch.atan2(turn[:, 3], turn[:, 0]) % (2 * pi)  # type: ignore[attr-defined]
     seen, failed = [], torch.zeros(STARTS, dtype=torch.bool)
     for _ in range(task.max_steps):
@@ -111,7 +115,7 @@ def task() -> jug.JugEnv:
     return task
 
 
-def test_the_script_lifts_by_the_handle_from_random_starts(task: jug.JugEnv):
+def test_the_script_lifts_by_the_handle_from_random_starts(task: tasks.DoraEnv):
     info = task.evaluate()
     success = info["success"] & ~task.spilt  # type: ignore[attr-defined]
     depth = info["penetration_max_mm"]
@@ -121,37 +125,40 @@ def test_the_script_lifts_by_the_handle_from_random_starts(task: jug.JugEnv):
         assert set(column.tolist()) >= {1, 2, 3}
 
 
-def test_jugs_start_at_any_yaw(task: jug.JugEnv):
+def test_jugs_start_at_any_yaw(task: tasks.DoraEnv):
     share = torch.histc(task.yaw, 8, 0, 2 * pi) / STARTS  # type: ignore[attr-defined]
     assert (share > 0.03).all()
 
 
-def test_what_fails_in_the_end_is_no_success(task: jug.JugEnv, monkeypatch: pytest.MonkeyPatch):
+def test_what_fails_in_the_end_is_no_success(task: tasks.DoraEnv, monkeypatch: pytest.MonkeyPatch):
     assert task.evaluate()["success"].any()
-    assert not task.failed(task.snapshot)[task.evaluate()["success"]].any()
-    monkeypatch.setattr(task, "failed", lambda s: torch.ones(STARTS, dtype=torch.bool))
+    assert not task.evaluate()["fail"][task.evaluate()["success"]].any()
+    lost = replace(task.mdp, failed=lambda s, memory: torch.ones(STARTS, dtype=torch.bool))
+    monkeypatch.setattr(task, "mdp", lost)
     assert task.evaluate()["finished"].any()
     assert not task.evaluate()["success"].any()
 
 
-def test_falling_over_and_being_dropped_are_failures(task: jug.JugEnv):
-    s = task.snapshot
-    assert jug.held(s).any()
-    assert not task.failed(s)[jug.held(s)].any()
-    n = len(s.object_p)
-    lying = jugs(n, object_q=tilted(radians(70)).repeat(n, 1), object_p=s.object_p, start_p=s.start_p)
-    assert task.failed(lying).all()
-    standing = jugs(n, object_p=s.start_p, start_p=s.start_p, supported=torch.ones(n, dtype=torch.bool))
-    assert torch.equal(task.failed(standing), task.episode.highest > jug.DROPPED)
-    assert task.failed(standing).any()
+def test_falling_over_and_being_dropped_are_failures(task: tasks.DoraEnv):
+    s, failed = task.snapshot, task.mdp.failed
+    held = jug.held(s, CONFIG)
+    assert held.any()
+    assert not failed(s, task.memory)[held].any()
+    n = len(s.object.p)
+    lying = jugs(n, object_q=tilted(radians(70)).repeat(n, 1), object_p=s.object.p, start_p=s.object.start_p)
+    assert failed(lying, task.memory).all()
+    standing = jugs(n, object_p=s.object.start_p, start_p=s.object.start_p, supported=torch.ones(n, dtype=torch.bool))
+    rose = torch.linspace(0.0, 0.1, n)
+    assert torch.equal(failed(standing, memory(n, highest=rose)), rose > CONFIG.dropped)
+    assert failed(standing, task.memory).any()
 
 
 def test_masses_range_from_empty_to_full():
     task = tasks.make_task("DoraJug-v1", 24, preset="standard")
     task.reset(seed=0)
-    mass = task.episode.mass
-    assert (mass >= jug.EMPTY).all()
-    assert (mass <= jug.FULL).all()
+    mass = task.memory.object.mass
+    assert (mass >= CONFIG.mass[0]).all()
+    assert (mass <= CONFIG.mass[1]).all()
     assert mass.min() < 0.36
     assert mass.max() > 0.54
     body = task.target_object._bodies[5]
@@ -164,9 +171,9 @@ def test_a_jug_stands_still_when_its_contacts_are_made_anew():
     task.reset(seed=0)
     for _ in range(9):
         task.step(None)
-    stood = task.snapshot.object_p
+    stood = task.snapshot.object.p
     task.set_state_dict(task.get_state_dict())
     for _ in range(6):
         task.step(None)
-        assert (task.snapshot.object_p - stood).abs().max() < 2e-4
+        assert (task.snapshot.object.p - stood).abs().max() < 2e-4
     task.close()

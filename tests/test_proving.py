@@ -53,7 +53,7 @@ def test_among_equals_the_one_reached_more_often_is_first():
 @pytest.mark.parametrize("env_id", [TASKS["cube"], TASKS["jug"]])
 def test_the_table_of_reachable_candidates_comes_along(env_id: str):
     task = make_task(env_id, 1)
-    table = task.reach_table
+    table = task.arm.reach_table
     task.close()
     assert table is not None
     assert (data_folder() / f"reach-{table.digest[:16]}.safetensors").is_file()

@@ -36,8 +36,8 @@ from dora.robot.motion.height_bounds import ArmHeightBounds, HandHeightBounds
 from dora.robot.motion.inverse_kinematics import ANGLE_TOLERANCE, POSITION_TOLERANCE, InverseKinematics
 from dora.robot.motion.planning import densified
 from dora.sim import controllers
-from dora.tasks.env.building import BuiltEnv
-from dora.tasks.guidance import grasp_and_lift as guidance
+from dora.tasks.guidance.grasp_and_lift import GraspSettings
+from dora.tasks.mdp.config import TaskConfig
 
 GRASPED = (0.06, 0.006, 0.12)
 """Middle of what a hand holds, in the wrist frame [m]."""
@@ -397,11 +397,12 @@ def test_a_grid_without_places_is_refused():
 def test_the_filter_has_the_numbers_of_the_tasks():
     """`dora.affordance` may not import the tasks, so some numbers stand in both."""
     ours = servo.Controller()
-    assert 1 / ours.period == BuiltEnv.CONTROL_FREQUENCY
+    assert ours.period == TaskConfig().dt
     assert (ours.speed, ours.spin) == (controllers.WRIST_SPEED, controllers.WRIST_SPIN)
     assert servo.LIMIT_MARGIN == controllers.LIMIT_MARGIN
-    assert (ours.descent * ours.period, ours.arrived) == (guidance.DESCENT, guidance.ARRIVED)
-    assert tuple(x / 2 for x in guidance.SETTLED) == ours.settled
+    reference = GraspSettings()
+    assert (ours.descent, ours.arrived) == (reference.descent, reference.arrived)
+    assert tuple(x / 2 for x in reference.settled) == ours.settled
 
 
 @pytest.mark.parametrize("change", ["controller", "kinematics"])

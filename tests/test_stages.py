@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dora.tasks.mdp.rewards import Term, Terms, closeness
+from dora.tasks.mdp.rewards import Term, Terms, tolerance
 from dora.tasks.mdp.stages import Stage, StageMachine
 
 
@@ -16,13 +16,15 @@ class State:
     height: Tensor
 
 
+DT = 0.05
+"""Duration of a control step [s]."""
 STAGES: list[Stage[State]] = [
-    Stage("reach", lambda s: closeness(s.distance, 0.02, 0.3), lambda s: s.distance < 0.03),
+    Stage("reach", lambda s: tolerance(s.distance, (0.0, 0.02), 0.3), lambda s: s.distance < 0.03),
     Stage(
         "lift",
         lambda s: (s.height / 0.1).clamp(0, 1),
         lambda s: s.height > 0.1,
-        hold=3,
+        hold=3 * DT,
         lost=lambda s: s.distance > 0.08,
         back_to="reach",
     ),
@@ -34,7 +36,7 @@ def state(distance: list[float], height: list[float]) -> State:
 
 
 def test_each_environment_walks_alone():
-    m = StageMachine(STAGES, 4)
+    m = StageMachine(STAGES, 4, DT)
     m.advance(state([0.5, 0.01, 0.01, 0.5], [0.0] * 4))
     assert m.index.tolist() == [0, 1, 1, 0]
     for _ in range(2):
@@ -49,7 +51,7 @@ def test_each_environment_walks_alone():
 
 
 def test_an_interrupted_hold_starts_again():
-    m = StageMachine(STAGES, 1)
+    m = StageMachine(STAGES, 1, DT)
     m.advance(state([0.01], [0.2]))
     for height in (0.2, 0.2, 0.0, 0.2, 0.2):
         m.advance(state([0.01], [height]))
@@ -58,7 +60,7 @@ def test_an_interrupted_hold_starts_again():
 
 
 def test_partial_reset_touches_only_its_rows():
-    m = StageMachine(STAGES, 5)
+    m = StageMachine(STAGES, 5, DT)
     m.index[:], m.held[:], m.furthest[:] = 1, 2, 1
     m.reset(torch.tensor([1, 3]))
     assert m.index.tolist() == [1, 0, 1, 0, 1]
@@ -67,7 +69,7 @@ def test_partial_reset_touches_only_its_rows():
 
 
 def test_state_round_trip_by_rows():
-    m, other = StageMachine(STAGES, 3), StageMachine(STAGES, 3)
+    m, other = StageMachine(STAGES, 3, DT), StageMachine(STAGES, 3, DT)
     m.index[:], m.held[:], m.furthest[:] = torch.tensor([0, 1, 2]), 2, 2
     rows = torch.tensor([2, 1])
     other.set_state({k: v[rows] for k, v in m.get_state().items()}, rows)
@@ -79,7 +81,7 @@ def test_batch_equals_singles():
     torch.manual_seed(0)
     steps, n = 40, 64
     d, z = torch.rand(steps, n) * 0.1, torch.rand(steps, n) * 0.2
-    big, singles = StageMachine(STAGES, n), [StageMachine(STAGES, 1) for _ in range(n)]
+    big, singles = StageMachine(STAGES, n, DT), [StageMachine(STAGES, 1, DT) for _ in range(n)]
     for t in range(steps):
         big.advance(State(d[t], z[t]))
         for i, m in enumerate(singles):
@@ -89,7 +91,7 @@ def test_batch_equals_singles():
 
 
 def test_score_is_bounded_and_ordered():
-    m = StageMachine(STAGES, 3)
+    m = StageMachine(STAGES, 3, DT)
     m.index[:] = torch.tensor([0, 1, 2])
     score = m.score(state([0.3, 0.01, 0.01], [0.0, 0.05, 0.2]))
     assert (score.diff() > 0).all()
@@ -100,7 +102,7 @@ def test_score_is_bounded_and_ordered():
 def test_terms_add_up_and_know_their_bounds():
     terms: Terms[State] = Terms(
         {
-            "near": Term(lambda s: closeness(s.distance, 0.0, 0.1), 2.0),
+            "near": Term(lambda s: tolerance(s.distance, margin=0.1), 2.0),
             "high": Term(lambda s: s.height, -1.0, "penalty"),
         }
     )
@@ -117,15 +119,32 @@ def test_guided_terms_can_be_taken_away():
     assert list(terms.without_guidance().terms) == ["b"]
 
 
-def test_closeness_hits_its_anchors():
-    d = torch.tensor([0.0, 0.02, 0.12])
-    torch.testing.assert_close(closeness(d, 0.02, 0.1), torch.tensor([1.0, 1.0, 0.1]))
+def test_tolerance_hits_its_anchors_on_both_sides():
+    x = torch.tensor([0.0, 0.02, 0.12, -0.1, 9.0])
+    shaped = tolerance(x, (0.0, 0.02), 0.1)
+    torch.testing.assert_close(shaped[:4], torch.tensor([1.0, 1.0, 0.1, 0.1]))
+    assert shaped[4] < 1e-6
+    torch.testing.assert_close(tolerance(x, (0.0, 0.02), 0.1, value_at_margin=0.5)[2], torch.tensor(0.5))
+    assert tolerance(x, (0.0, 0.02)).tolist() == [1.0, 1.0, 0.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize(("tolerance", "reach"), [(-0.1, 1.0), (0.0, 0.0)])
-def test_closeness_refuses_bad_anchors(tolerance: float, reach: float):
-    with pytest.raises(ValueError, match="tolerance"):
-        closeness(torch.zeros(1), tolerance, reach)
+@pytest.mark.parametrize(
+    ("bounds", "margin", "value"), [((0.1, 0.0), 1.0, 0.1), ((0.0, 0.0), -1.0, 0.1), ((0.0, 0.0), 1.0, 1.0)]
+)
+def test_tolerance_refuses_bad_anchors(bounds: tuple[float, float], margin: float, value: float):
+    with pytest.raises(ValueError, match="lower <= upper"):
+        tolerance(torch.zeros(1), bounds, margin, value)
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.025, 0.01])
+def test_a_hold_lasts_equally_long_at_every_control_rate(dt: float):
+    held: Stage[State] = Stage("hold", lambda s: s.height, lambda s: s.height > 0.1, hold=0.15)
+    m = StageMachine([held], 1, dt)
+    steps = 0
+    while not m.finished.item():
+        m.advance(state([0.0], [0.2]))
+        steps += 1
+    assert steps * dt == pytest.approx(0.15)
 
 
 def test_bad_tables_are_refused():
@@ -133,11 +152,11 @@ def test_bad_tables_are_refused():
         return s.height
 
     with pytest.raises(ValueError, match="repeat"):
-        StageMachine([Stage("a", value, value), Stage("a", value, value)], 1)
+        StageMachine([Stage("a", value, value), Stage("a", value, value)], 1, DT)
     with pytest.raises(ValueError, match="not an earlier stage"):
-        StageMachine([Stage("a", value, value, lost=value, back_to="b"), Stage("b", value, value)], 1)
+        StageMachine([Stage("a", value, value, lost=value, back_to="b"), Stage("b", value, value)], 1, DT)
     with pytest.raises(ValueError, match="both lost and back_to"):
-        StageMachine([Stage("a", value, value, lost=value)], 1)
+        StageMachine([Stage("a", value, value, lost=value)], 1, DT)
     with pytest.raises(ValueError, match="at least one term"):
         Terms({})
     with pytest.raises(ValueError, match="penalty"):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import dora.tasks as tasks
 from dora.errors import InputError
-from dora.tasks.env.base import DoraEnv
+from dora.tasks.env.env import DoraEnv
 
 BATCH = 6
 """Environments in a batch."""
@@ -73,9 +73,9 @@ def test_terms_add_up_to_the_reward_within_their_bounds(batch: DoraEnv):
         _, reward, *_, info = batch.step(a)
         parts = {k: v for k, v in info.items() if k.startswith("reward/")}
         torch.testing.assert_close(reward, torch.stack(list(parts.values())).sum(0))
-        assert ((reward >= batch._terms.lower) & (reward <= batch._terms.upper)).all()
+        assert ((reward >= batch.terms.lower) & (reward <= batch.terms.upper)).all()
         for name, value in parts.items():
-            term = batch._terms.terms[name.removeprefix("reward/")]
+            term = batch.terms.terms[name.removeprefix("reward/")]
             low, high = sorted((0.0, term.weight))
             assert ((value >= low - 1e-6) & (value <= high + 1e-6)).all(), name
 
@@ -122,8 +122,8 @@ def test_state_round_trip_restores_stage_observation_and_future(batch: DoraEnv):
     torch.testing.assert_close(batch.get_obs(batch.get_info()), seen, atol=5e-3, rtol=0.02)
     batch.step(batch.scripted_action())
     # PhysX forgets contacts, so what touches settles anew after a restoration.
-    torch.testing.assert_close(batch.snapshot.object_p, after.object_p, atol=5e-4, rtol=0)
-    torch.testing.assert_close(batch.snapshot.hand_q, after.hand_q, atol=4e-3, rtol=0)
+    torch.testing.assert_close(batch.snapshot.object.p, after.object.p, atol=5e-4, rtol=0)
+    torch.testing.assert_close(batch.snapshot.hand.q, after.hand.q, atol=4e-3, rtol=0)
 
 
 @pytest.mark.parametrize("which", [[2], [0, 1, 3, 4, 5]])
@@ -206,11 +206,11 @@ def test_guidance_removes_exactly_what_it_adds(env_id: str):
     extra = [k for k, e in guided.observation_entries.items() if e.guided]
     assert extra
     assert list(plain.observation_entries) == [k for k in guided.observation_entries if k not in extra]
-    assert list(plain._terms.terms) == [k for k, t in guided._terms.terms.items() if not t.guided]
+    assert list(plain.terms.terms) == [k for k, t in guided.terms.terms.items() if not t.guided]
     assert guided.action_size == plain.action_size
     # One initial state and one success test for both.
     a, b = guided.reset(seed=7)[0], plain.reset(seed=7)[0]
-    torch.testing.assert_close(guided.snapshot.object_p, plain.snapshot.object_p, atol=0, rtol=0)
+    torch.testing.assert_close(guided.snapshot.object.p, plain.snapshot.object.p, atol=0, rtol=0)
     assert a.shape[-1] > b.shape[-1]
     guided.close()
     plain.close()

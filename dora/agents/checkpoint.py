@@ -1,6 +1,5 @@
 """Checkpoints: safetensors files with everything a run needs to go on, and what they belong to."""
 
-import dataclasses
 import hashlib
 import json
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from dora.agents.config import RunConfig, config_from_dict
+from dora.configs import plain
 from dora.errors import InputError
 from dora.files import write_bytes
 
@@ -29,12 +29,14 @@ class Checkpoint:
     sizes: numbers of observation and action components.
     tensors: flat names and values.
     progress: counters of the run (environment steps, seconds, best evaluation ...).
+    config_digest: digest of the settings as it was written.
     """
 
     config: RunConfig
     sizes: tuple[int, int]
     tensors: dict[str, Tensor]
     progress: dict[str, Any] = field(default_factory=dict)
+    config_digest: str = ""
 
     def write(self, path: Path) -> None:
         """Write atomically.
@@ -46,7 +48,7 @@ class Checkpoint:
         metadata = {
             "format": FORMAT,
             "version": str(VERSION),
-            "config": json.dumps(dataclasses.asdict(self.config)),
+            "config": json.dumps(plain(self.config)),
             "config_digest": self.config.digest(),
             "sizes": json.dumps(self.sizes),
             "progress": json.dumps(self.progress),
@@ -83,6 +85,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         (observation, action),
         tensors,
         json.loads(metadata["progress"]),
+        metadata["config_digest"],
     )
 
 

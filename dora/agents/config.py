@@ -1,14 +1,23 @@
 """Settings of a run: what `config.yaml` holds, and their digest."""
 
 import dataclasses
-import hashlib
-import json
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
-AGENTS = ("ppo", "sac", "mappo", "happo")
-SINGLE_ARM_AGENTS = ("ppo", "sac")
-GUIDANCES = ("affordance", "none")
+import tyro
+import yaml
+
+from dora.configs import built, overridden, plain
+from dora.digests import digest_of
+from dora.errors import InputError
+
+Numbers = TypeVar("Numbers")
+"""Numbers of the task: a dict of plain data, or the task's own dataclass on the command line."""
+Settings = TypeVar("Settings")
+"""Settings of the learner."""
+Agent = TypeVar("Agent")
+"""Name of the learner."""
 
 
 @dataclass(frozen=True)
@@ -95,73 +104,103 @@ class SACConfig:
     """Widths of the hidden layers of actor and critics."""
 
 
+LEARNER_CONFIGS: dict[str, type[PPOConfig] | type[SACConfig]] = {"ppo": PPOConfig, "sac": SACConfig}
+"""Settings of each learner."""
+
+
 @dataclass(frozen=True)
-class RunConfig:
+class RunConfig(Generic[Numbers, Settings, Agent]):
     """Everything that decides the outcome of a run."""
 
     env: str
-    """Task id."""
-    agent: str
+    """Task id, for example DoraCube-v1."""
+    agent: Agent
     """Learner."""
-    guidance: str
-    """`affordance` or `none`."""
+    guidance: Literal["affordance", "none"] = "affordance"
+    """Use affordance maps and grasp candidates, or nothing of them."""
+    guidance_parts: tuple[Literal["observation", "reward", "filter", "prior"], ...] | None = None
+    """Parts of guidance in force, for ablations; None: all of them."""
+    preset: Literal["none", "standard", "hard"] = "standard"
+    """How much episodes are randomised and perturbed."""
     seed: int = 0
-    """Seed of everything random."""
+    """Seed of weights, exploration and initial states."""
     total_steps: int = 300_000
-    """Environment steps, summed over all environments."""
+    """Budget in environment steps, summed over all environments."""
     num_envs: int = 32
-    """Environments in each worker."""
+    """Environments in EACH worker."""
     workers: int = 1
     """Worker processes; 0 collects in the main process."""
     learner_threads: int = 1
     """Threads of the learner; more help on idle cores and cost much on busy ones (they wait by spinning)."""
     eval_every: int = 50_000
-    """Environment steps between evaluations."""
+    """Environment steps between evaluations during training."""
     eval_episodes: int = 64
     """Episodes of a periodic evaluation."""
-    final_episodes: int = 200
+    final_episodes: Annotated[int, tyro.conf.arg(name="episodes")] = 200
     """Episodes of the last evaluation, which `result.json` reports."""
     eval_envs: int = 32
     """Environments of the evaluation task."""
     stop_success: float | None = None
-    """End when two successive evaluations reach this success rate."""
+    """End early when two successive evaluations reach this success rate, 0 to 1."""
     checkpoint_seconds: float = 15.0
-    """Wall time between checkpoints, s."""
+    """Wall time between checkpoints [s]."""
     normaliser_samples: int = 300_000
     """Observations after which the observation normaliser stays as it is."""
     stagger: bool = True
     """End the first episodes at random steps, so that resets spread over time."""
-    task: dict[str, Any] = field(default_factory=dict)
-    """Further arguments of the task, such as `preset` and `guidance_parts`."""
-    learner: PPOConfig | SACConfig = field(default_factory=PPOConfig)
+    task: Numbers = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
+    """Numbers of the task, all of them: weights, thresholds, randomisation, rates."""
+    learner: Settings = field(default_factory=PPOConfig)  # pyright: ignore[reportAssignmentType]
     """Settings of the learner."""
 
     @property
     def has_prior(self) -> bool:
-        """Whether actions correct a reference, so that zero actions are a policy worth measuring."""
-        parts = self.task.get("guidance_parts")
-        return self.guidance == "affordance" and (parts is None or "prior" in parts)
+        """Whether actions are residuals of a reference, so that zero actions are a policy worth measuring."""
+        return self.guidance == "affordance" and (self.guidance_parts is None or "prior" in self.guidance_parts)
+
+    @property
+    def task_options(self) -> dict[str, Any]:
+        """Arguments with which the task is made; without numbers of the task, its own are in force."""
+        parts = None if self.guidance_parts is None else list(self.guidance_parts)
+        options = {"guidance": self.guidance, "guidance_parts": parts, "preset": self.preset}
+        return options | ({"config": self.task} if self.task else {})
 
     def digest(self) -> str:
         """Twelve hexadecimal digits that differ between settings; `total_steps` may grow and is left out."""
-        content = dataclasses.asdict(self)
+        content = plain(self)
         del content["total_steps"]
-        if not content["task"]:
-            del content["task"]
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
-
-
-LEARNER_CONFIGS: dict[str, type[PPOConfig] | type[SACConfig]] = {"ppo": PPOConfig, "sac": SACConfig}
+        return digest_of(content)[:12]
 
 
 def config_from_dict(content: dict[str, Any]) -> RunConfig:
-    """Rebuild a `RunConfig` from what `dataclasses.asdict` made of it.
+    """Rebuild a `RunConfig` from what `dora.configs.plain` made of it, also of a version without numbers of the task.
 
     Raises:
-        TypeError, KeyError: if names are missing or unknown.
+        InputError: if names are missing or unknown, or a value has the wrong type.
     """
-    fields: dict[str, Any] = dict(content)
-    learner: dict[str, Any] = dict(fields["learner"])
-    learner["hidden"] = tuple(learner["hidden"])
-    fields["learner"] = LEARNER_CONFIGS[fields["agent"]](**learner)
-    return RunConfig(**fields)
+    content = upgraded(content)
+    agent = content.get("agent")
+    if agent not in LEARNER_CONFIGS:
+        raise InputError(f"the settings name the learner {agent!r}; there are {', '.join(LEARNER_CONFIGS)}.")
+    fields = dict(content, task={}, learner=None)
+    read: Any = built(RunConfig, {name: value for name, value in fields.items() if name not in ("task", "learner")})
+    learner = overridden(LEARNER_CONFIGS[agent](), content.get("learner", {}), "learner")
+    task = content.get("task", {})
+    if not isinstance(task, dict):
+        raise InputError(f"the numbers of the task must be a mapping, not {task!r}.")
+    return dataclasses.replace(read, task=task, learner=learner)
+
+
+def upgraded(content: dict[str, Any]) -> dict[str, Any]:
+    """Settings of a version whose `task` held only preset and parts of guidance, with the numbers that were in force.
+
+    The numbers are those of `first_numbers.yaml`, written down when the tasks' numbers became settings.
+    """
+    if "preset" in content or not isinstance(content.get("task", {}), dict):
+        return content
+    options = dict(content.get("task", {}))
+    preset = options.pop("preset", "standard")
+    first = yaml.safe_load((Path(__file__).parent / "first_numbers.yaml").read_text())
+    numbers = first["tasks"].get(content.get("env"))
+    task = {} if numbers is None else {**numbers, "randomisation": first["presets"][preset]}
+    return {**content, "preset": preset, "guidance_parts": options.pop("guidance_parts", None), "task": task}

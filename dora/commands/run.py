@@ -1,9 +1,11 @@
 """Train or evaluate a learner on a Dora task.
 
     python experiments/run.py --env DoraCube-v1
+    python experiments/run.py --env DoraCube-v1 --task.lift 0.12 --learner.gamma 0.97
 
 Trains with the recommended settings, evaluates the best policy on fixed seeds and writes a run folder, whose
-path is the last line printed. Ctrl-C saves; `--resume FOLDER` goes on.
+path is the last line printed. Ctrl-C saves; `--resume FOLDER` goes on. Every number of the task and of the learner is
+an option; the defaults that are shown are those of the task that --env names.
 """
 
 import datetime
@@ -11,49 +13,44 @@ import functools
 import logging
 import shlex
 import sys
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Generic, Literal
 
 import tyro
 
 from dora.agents.checkpoint import read_checkpoint
-from dora.agents.config import RunConfig
+from dora.agents.config import LEARNER_CONFIGS, Agent, Numbers, RunConfig, Settings
 from dora.agents.evaluation.evaluate import outcome
 from dora.agents.evaluation.play import checkpoint_path, evaluate_checkpoint, load_policy, record
-from dora.agents.runs.presets import recommended, with_total_steps
+from dora.agents.runs.recommended import check, recommended
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.agents.runs.trainer import Trainer
+from dora.configs import plain
 from dora.errors import InputError
-from dora.tasks import check_task_id, make_task
+from dora.tasks import find_task, make_task
+from dora.tasks.env.options import task_config
+from dora.tasks.mdp.guidance_parts import guidance_in_force
+from dora.tasks.mdp.randomisation import find_preset
+from dora.tools.arguments import early_value, early_values
 
 VIDEO_EPISODES = 3
-INTERRUPTED = 130  # exit status after Ctrl-C
-BAD_INPUT = 2  # exit status after input that a person can mend
+"""Episodes of a film [1]."""
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+BAD_INPUT = 2
+"""Exit status after input that a person can mend."""
+SHOWN = "DoraHammer-v1"
+"""Task whose defaults --help shows if --env names none."""
 
 
-@dataclass
-class Args:
+@dataclass(frozen=True, kw_only=True)
+class Args(Generic[Numbers, Settings, Agent]):
     """Train or evaluate a learner; an option left out takes the recommended value of the task."""
 
-    env: str | None = None
-    """Task id, for example DoraCube-v1."""
-    agent: Literal["ppo", "sac", "mappo", "happo"] | None = None
-    """Learner (default: the one recommended for the task, docs/agents.md)."""
-    guidance: Literal["affordance", "none"] | None = None
-    """Use affordance maps and grasp candidates, or nothing of them (default affordance)."""
-    guidance_parts: tuple[Literal["observation", "reward", "filter", "prior"], ...] | None = None
-    """Parts of guidance in force, for ablations (default all)."""
-    preset: Literal["none", "standard", "hard"] | None = None
-    """How much episodes are randomised and disturbed (default standard)."""
-    seed: int | None = None
-    """Seed of weights, exploration and initial states (default 0)."""
-    total_steps: int | None = None
-    """Budget in environment steps, summed over all environments."""
-    num_envs: int | None = None
-    """Environments in EACH worker."""
-    workers: int | None = None
-    """Worker processes (default: one per core); 0 collects in the main process."""
+    run: Annotated[RunConfig[Numbers, Settings, Agent], tyro.conf.arg(name="")]
+    """Settings of the run."""
     out: Path | None = None
     """Run folder to make (default runs/<env>/<agent>-<guidance>-s<seed>-<time>)."""
     resume: Path | None = None
@@ -62,65 +59,73 @@ class Args:
     """Evaluate --checkpoint instead of training."""
     checkpoint: Path | None = None
     """Checkpoint to evaluate: a .safetensors file, or a run folder for its best one."""
-    episodes: int | None = None
-    """Episodes of the final evaluation (default 200)."""
     video: bool = False
     """Film a few episodes of the policy at the end (needs a Vulkan driver)."""
-    eval_every: int | None = None
-    """Environment steps between evaluations during training."""
-    stop_success: float | None = None
-    """End early when two successive evaluations reach this success rate, 0 to 1."""
-    noise_correlation: float | None = None
-    """Correlation of the exploration noise of successive steps, 0 to below 1."""
 
 
-def task_options(args: Args) -> dict[str, Any]:
-    """The arguments of the task that are given."""
-    given = {"preset": args.preset, "guidance_parts": args.guidance_parts and list(args.guidance_parts)}
-    return {name: value for name, value in given.items() if value is not None}
+def parse(words: Sequence[str]) -> Args[dict[str, Any], Any, str]:
+    """The options of a command line, the settings of the run with all numbers of its task.
+
+    Raises:
+        InputError: for a task, learner or folder that is not there, or values that make no sense.
+    """
+    base = settings_to_start_from(words)
+    task = find_task(base.env)
+    numbers = task_config(task.CONFIG, base.preset, base.task)
+    agents = Literal[tuple(task.LEARNERS)]  # pyright: ignore[reportInvalidTypeForm]
+    form: Any = Args[task.CONFIG, LEARNER_CONFIGS[base.agent], agents]  # pyright: ignore[reportInvalidTypeArguments, reportInvalidTypeForm]
+    args = tyro.cli(form, default=Args(run=replace(base, task=numbers)), description=__doc__, args=list(words))
+    numbers = task_config(task.CONFIG, args.run.preset, args.run.task)
+    config = replace(args.run, task=plain(numbers))
+    check(config)
+    guidance_in_force(config.guidance, config.guidance_parts)
+    return replace(args, run=config)
 
 
-def settings(args: Args) -> RunConfig:
-    """Settings for a new run."""
-    if args.env is None:
+def settings_to_start_from(words: Sequence[str]) -> RunConfig:
+    """Settings whose values are the defaults of the options: those of the run or checkpoint that is named, or the
+    recommended ones of the task."""
+    env, resume, checkpoint = (early_value(words, f"--{name}") for name in ("env", "resume", "checkpoint"))
+    if resume is not None:
+        return RunFolder(Path(resume)).read_config()
+    preset = early_value(words, "--preset")
+    if "--eval-only" in words:
+        if checkpoint is None:
+            raise InputError("--eval-only needs --checkpoint with a .safetensors file or a run folder.")
+        config = read_checkpoint(checkpoint_path(Path(checkpoint))).config
+        if preset is None:
+            return config
+        return replace(config, preset=preset, task=config.task | {"randomisation": plain(find_preset(preset))})
+    if checkpoint is not None:
+        raise InputError("--checkpoint is only evaluated: add --eval-only, or go on with a run by --resume.")
+    if env is None and not {"-h", "--help"} & set(words):
         raise InputError("No task is given: add --env, for example --env DoraCube-v1.")
+    guidance, parts = early_value(words, "--guidance"), early_values(words, "--guidance-parts")
     return recommended(
-        args.env,
-        args.agent,
-        guidance=args.guidance,
-        seed=args.seed,
-        total_steps=args.total_steps,
-        num_envs=args.num_envs,
-        workers=args.workers,
-        final_episodes=args.episodes,
-        eval_every=args.eval_every,
-        stop_success=args.stop_success,
-        task=task_options(args),
-        learner={"noise_correlation": args.noise_correlation},
+        env or SHOWN,
+        early_value(words, "--agent"),
+        find_task(env or SHOWN).LEARNERS,
+        guidance=guidance,
+        guidance_parts=None if parts is None else tuple(parts),
+        preset=preset,
     )
 
 
-def resumed_settings(args: Args, config: RunConfig) -> RunConfig:
-    """Settings of the run to go on with; refuses any that differ from what it was started with."""
-    asked = {
-        "env": args.env,
-        "agent": args.agent,
-        "guidance": args.guidance,
-        "seed": args.seed,
-        "num_envs": args.num_envs,
-        "workers": args.workers,
-        "final_episodes": args.episodes,
-        "eval_every": args.eval_every,
-        "stop_success": args.stop_success,
-        "task": task_options(args) or None,
-    }
-    for name, value in asked.items():
-        if value is not None and value != getattr(config, name):
+def refuse_other_settings(folder: Path, stored: RunConfig, asked: RunConfig) -> None:
+    """Refuses settings that differ from what a run was started with; `total_steps` may.
+
+    Raises:
+        InputError: naming the first difference.
+    """
+    for f in fields(stored):
+        theirs, ours = getattr(stored, f.name), getattr(asked, f.name)
+        if f.name == "task":
+            theirs, ours = (plain(task_config(find_task(stored.env).CONFIG, stored.preset, t)) for t in (theirs, ours))
+        if f.name != "total_steps" and theirs != ours:
             raise InputError(
-                f"The run in {args.resume} has {name} {getattr(config, name)}, not {value}: "
+                f"The run in {folder} has {f.name} {theirs}, not {ours}: "
                 "leave the option out, or start a new run without --resume."
             )
-    return with_total_steps(config, args.total_steps)
 
 
 def default_folder(config: RunConfig, suffix: str = "") -> Path:
@@ -129,23 +134,22 @@ def default_folder(config: RunConfig, suffix: str = "") -> Path:
     return Path("runs") / config.env / f"{config.agent}-{config.guidance}-s{config.seed}-{time}{suffix}"
 
 
+def task_maker(config: RunConfig) -> Any:
+    """Makes a batch of the run's task from the number of environments; can be sent to other processes."""
+    return functools.partial(make_task, config.env, **config.task_options)
+
+
 def train(args: Args) -> tuple[Path, bool]:
     """Start or resume a run; returns its folder and whether it finished."""
-    if args.checkpoint is not None:
-        raise InputError("--checkpoint is only evaluated: add --eval-only, or go on with a run by --resume.")
+    config = args.run
     if args.resume is not None:
         folder = RunFolder(args.resume)
-        config = resumed_settings(args, folder.read_config())
-        check_task_id(config.env)
+        refuse_other_settings(args.resume, folder.read_config(), config)
         folder.write_config(config)
     else:
-        config = settings(args)
-        check_task_id(config.env)
         folder = RunFolder(args.out or default_folder(config))
         folder.create(config)
-    make_task_batch = functools.partial(make_task, config.env, guidance=config.guidance, **config.task)
-    trainer = Trainer(config, make_task_batch, folder, resume=args.resume is not None)
-    result = trainer.run()
+    result = Trainer(config, task_maker(config), folder, resume=args.resume is not None).run()
     if not result["finished"]:
         command = ["python", *sys.argv[:1], "--resume", str(folder.path)]
         print(f"Interrupted and saved. To go on: {shlex.join(command)}", file=sys.stderr)
@@ -156,20 +160,10 @@ def train(args: Args) -> tuple[Path, bool]:
 
 def evaluate_only(args: Args) -> Path:
     """Evaluate a checkpoint into a new run folder, which is returned."""
-    if args.checkpoint is None:
-        raise InputError("--eval-only needs --checkpoint with a .safetensors file or a run folder.")
-    path = checkpoint_path(args.checkpoint)
-    theirs = read_checkpoint(path).config
-    asked = {"agent": args.agent or theirs.agent, "guidance": args.guidance or theirs.guidance}
-    config = recommended(
-        args.env or theirs.env, **asked, seed=theirs.seed, num_envs=theirs.num_envs,
-        workers=theirs.workers if args.workers is None else args.workers,
-        final_episodes=args.episodes, total_steps=theirs.total_steps, task=theirs.task | task_options(args),
-    )  # fmt: skip
-    check_task_id(config.env)
-    make_task_batch = functools.partial(make_task, config.env, guidance=config.guidance, **config.task)
+    assert args.checkpoint is not None
+    path, config = checkpoint_path(args.checkpoint), args.run
     print(f"evaluation on {config.final_episodes} episodes ...", file=sys.stderr)
-    checkpoint, evaluation, zero = evaluate_checkpoint(path, config, make_task_batch)
+    checkpoint, evaluation, zero = evaluate_checkpoint(path, config, task_maker(config))
     print(outcome(evaluation, zero), file=sys.stderr)
     folder = RunFolder(args.out or default_folder(config, "-eval"))
     folder.create(config)
@@ -193,8 +187,7 @@ def evaluate_only(args: Args) -> Path:
 def film(checkpoint: Path, config: RunConfig, path: Path) -> None:
     """Film the policy of a checkpoint, or say in one line why not."""
     policy = load_policy(read_checkpoint(checkpoint), checkpoint)
-    options = config.task | {"render_mode": "rgb_array"}
-    make_single_task = functools.partial(make_task, config.env, 1, config.guidance, **options)
+    make_single_task = functools.partial(task_maker(config), 1, render_mode="rgb_array")
     try:
         record(make_single_task, policy.greedy, path, VIDEO_EPISODES)
     except (RuntimeError, InputError) as error:
@@ -204,9 +197,9 @@ def film(checkpoint: Path, config: RunConfig, path: Path) -> None:
 
 def main() -> int:
     """Run the command; returns the exit status."""
-    args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     try:
+        args = parse(sys.argv[1:])
         if args.eval_only:
             folder, finished = evaluate_only(args), True
         else:

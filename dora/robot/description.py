@@ -102,7 +102,7 @@ class RobotDescription:
     """A robot as data, shared by the simulator's robot, the grasp optimiser and the controllers.
 
     `shapes` and `contacts` are keyed by link; `ignored_pairs` are link pairs whose collisions cannot
-    matter (alphabetical within a pair), all others collide.
+    matter (alphabetical within a pair), all others collide; `tip_radius` is that of the fingertips [m].
     """
 
     name: str
@@ -114,6 +114,7 @@ class RobotDescription:
     couplings: tuple[Coupling, ...]
     wrist_link: str
     palm_link: str
+    tip_radius: float
     fingers: dict[str, Finger]
     postures: dict[str, Posture]
     shapes: dict[str, tuple[Shape, ...]]

@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 KEYS = {
     "robot.toml": (
-        ("name", "urdf", "wrist_link", "palm_link", "arm", "hand", "fingers", "postures", "contact"),
+        ("name", "urdf", "wrist_link", "palm_link", "tip_radius", "arm", "hand", "fingers", "postures", "contact"),
         ("coupling", "no_collision"),
     ),
     "joint group": (("joints", "stiffness", "damping", "armature"), ()),
@@ -104,6 +104,7 @@ class _Reader:
             couplings=self.couplings(content.get("coupling", []), hand),
             wrist_link=self.link(content["wrist_link"]),
             palm_link=self.link(content["palm_link"]),
+            tip_radius=self.length(content["tip_radius"], "tip_radius"),
             fingers={name: self.finger(name, row, hand) for name, row in content["fingers"].items()},
             postures={name: self.posture(name, row, arm, hand) for name, row in content["postures"].items()},
             shapes=shapes,
@@ -142,6 +143,13 @@ class _Reader:
             raise self.fail(f"{where} must be finite numbers.")
         array.flags.writeable = False
         return array
+
+    def length(self, value: Any, where: str) -> float:
+        """A positive length [m]."""
+        number = float(self.numbers(value, 1, where)[0])
+        if number <= 0:
+            raise self.fail(f"{where} must be a positive length in metres, not {number:g}.")
+        return number
 
     def names(self, names: Sequence[T], where: str) -> tuple[T, ...]:
         if not isinstance(names, list) or len(set(names)) != len(names):

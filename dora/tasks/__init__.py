@@ -1,15 +1,26 @@
-"""The task suite. Importing it registers every Dora id with ManiSkill and gymnasium."""
+"""The task suite. Importing it registers every task found here with ManiSkill and gymnasium."""
 
 import difflib
+import importlib
+import pkgutil
 from typing import Any
 
 import gymnasium as gym
 
 from dora.errors import InputError
-from dora.tasks import cube as cube
-from dora.tasks import jug as jug
-from dora.tasks.env.base import DoraEnv
-from dora.tasks.hammer import env as _hammer  # noqa: F401
+from dora.tasks.env.env import DoraEnv
+from dora.tasks.env.registration import TASKS
+from dora.tasks.env.task import Task
+
+ROOMS = ("env", "guidance", "mdp")
+"""Packages here that are not tasks: every other module or package is one, found by its place."""
+
+
+def discover() -> None:
+    """Imports every task of this package, which registers it."""
+    for found in pkgutil.iter_modules(__path__):
+        if found.name not in ROOMS:
+            importlib.import_module(f"{__name__}.{found.name}")
 
 
 def task_ids() -> list[str]:
@@ -23,6 +34,16 @@ def check_task_id(env_id: str) -> None:
         near = difflib.get_close_matches(env_id, task_ids(), 1)
         hint = f"; did you mean {near[0]}?" if near else ""
         raise InputError(f"unknown environment {env_id!r}{hint} (known: {', '.join(task_ids())})")
+
+
+def find_task(env_id: str) -> type[Task]:
+    """What a registered id is about: its class of `Task`.
+
+    Raises:
+        InputError: for an unknown id.
+    """
+    check_task_id(env_id)
+    return TASKS[env_id]
 
 
 def make_task(env_id: str, num_envs: int, guidance: str = "affordance", **options: Any) -> DoraEnv:
@@ -42,3 +63,6 @@ def make_task(env_id: str, num_envs: int, guidance: str = "affordance", **option
     task = gym.make(env_id, num_envs=num_envs, guidance=guidance, **options).unwrapped
     assert isinstance(task, DoraEnv)
     return task
+
+
+discover()

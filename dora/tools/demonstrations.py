@@ -11,7 +11,7 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 from dora.errors import InputError
 from dora.tasks import check_task_id
-from dora.tasks.env.base import DoraEnv
+from dora.tasks.env.env import DoraEnv
 
 
 @dataclass(frozen=True)

@@ -3,15 +3,12 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import torch
-from mani_skill.utils.registration import REGISTERED_ENVS
 
 from dora.errors import InputError
 from dora.sim.grasp_tests.test_scene import Physics
-from dora.tasks import check_task_id, make_task
-from dora.tasks.env.base import DoraEnv
+from dora.tasks import find_task, make_task
 
 TUNNELLED = 0.010
 """Overlap at which a body is more inside another one than outside: about the radius of a finger or a handle [m]."""
@@ -74,8 +71,7 @@ def measure_physics(
     """
     if starts < 1:
         raise InputError(f"physics is compared on at least one start, not {starts}")
-    check_task_id(env_id)
-    control = cast(type[DoraEnv], REGISTERED_ENVS[env_id].cls).CONTROL_FREQUENCY
+    control = find_task(env_id).CONFIG().control_frequency
     for physics in settings:
         if physics.rate % control:
             raise InputError(f"{physics.rate:g} Hz is no multiple of the {control} Hz at which {env_id} is controlled")

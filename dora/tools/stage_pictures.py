@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from dora.errors import InputError
 from dora.sim.batch.rendering import can_render
 from dora.tasks import make_task, task_ids
-from dora.tools.task_pages import short_name
+from dora.tasks.env.task import short_name
 
 SEEDS = range(1, 21)
 """Starts that are tried, in order, until the scripted solution completes all stages (at 0 the jug hides its handle)."""

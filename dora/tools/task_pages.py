@@ -7,52 +7,43 @@ import sys
 from pathlib import Path
 
 from dora.tasks import make_task, task_ids
-from dora.tasks.env.base import DoraEnv
+from dora.tasks.env.description import config_rows, limit_rows, observation_rows, stage_rows, term_rows
+from dora.tasks.env.env import DoraEnv
+from dora.tasks.env.task import short_name
 from dora.tasks.mdp.randomisation import PRESETS
 
 BEGIN, END = "<!-- generated: begin -->", "<!-- generated: end -->"
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
+TITLES = {
+    "Observation ({size} numbers with guidance)": observation_rows,
+    "Action ({actions} numbers in [-1, 1])": None,
+    "Stages": stage_rows,
+    "Reward terms": term_rows,
+    "Limits": limit_rows,
+    "Numbers": config_rows,
+}
+"""Sections of a page; the action is told in words."""
+ACTION = (
+    "0-2 wrist translation, 3-5 wrist rotation, then hand joints thumb to pinky. With guidance: the residual action on "
+    "the reference, in units of its bounds, in the hand frame."
+)
+"""What an action is."""
+
+
+def _table(rows: list[list[str]]) -> str:
+    lines = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
 def tables(task: DoraEnv) -> str:
-    """Markdown tables of observation, action, stages and reward terms of a guided task."""
-    s = task.snapshot
-    observation, start = [], 0
-    for name, entry in task.observation_entries.items():
-        size = entry.value(s).shape[-1]
-        who = "prior" if entry.prior else "guided" if entry.guided else "both"
-        observation.append([f"{start}-{start + size - 1}", f"`{name}`", str(size), entry.unit, entry.doc, who])
-        start += size
-    stages = [[f"`{x.name}`", str(x.hold), f"`{x.back_to}`" if x.back_to else "never"] for x in task.machine.stages]
-    terms = [
-        [f"`{name}`", t.part, f"{t.weight:g}", t.doc, "guided" if t.guided else "both"]
-        for name, t in task.TERMS.terms.items()
-    ]
-    limits = [
-        ["control / physics", f"{task.CONTROL_FREQUENCY} / {task.PHYSICS_FREQUENCY} Hz"],
-        ["episode", f"{task.MAX_STEPS} steps, {task.MAX_STEPS / task.CONTROL_FREQUENCY:g} s"],
-        ["solver position iterations", str(task.SOLVER_ITERATIONS)],
-        ["deepest penetration of a success", f"{task.PENETRATION_LIMIT * 1000:g} mm"],
-    ]
-    return "\n\n".join(
-        (
-            f"### Observation ({start} numbers with guidance)",
-            _table(["index", "entry", "size", "unit", "meaning", "exists"], observation),
-            f"### Action ({task.action_size} numbers in [-1, 1])",
-            "0-2 wrist translation, 3-5 wrist rotation, then hand joints thumb to pinky. With guidance: the correction "
-            "of the reference, in units of its bounds, in the hand frame.",
-            "### Stages",
-            _table(["stage", "steps to hold", "falls back to"], stages),
-            "### Reward terms",
-            _table(["term", "part", "weight", "meaning", "exists"], terms),
-            "### Limits",
-            _table(["what", "value"], limits),
-        )
-    )
+    """Markdown tables of observation, action, stages, reward terms, limits and numbers of a guided task."""
+    size = task.single_observation_space.shape[0]  # pyright: ignore[reportOptionalSubscript]
+    sections = []
+    for title, rows in TITLES.items():
+        sections.append(f"### {title.format(size=size, actions=task.action_size)}")
+        sections.append(ACTION if rows is None else _table(rows(task)))
+    return "\n\n".join(sections)
 
 
 def _plus_minus(value: float, unit: str, factor: float = 1.0) -> str:
@@ -79,7 +70,7 @@ def preset_table() -> str:
         "pushes": pushes,
     }
     names = [f"`{name}`" for name in PRESETS]
-    return _table(["what", *names], [[what, *values] for what, values in rows.items()])
+    return _table([["what", *names], *([what, *values] for what, values in rows.items())])
 
 
 def refreshed(page: str, generated: str) -> str:
@@ -89,11 +80,6 @@ def refreshed(page: str, generated: str) -> str:
     if not mark or not end:
         raise ValueError(f"the page lacks the marks {BEGIN} and {END}")
     return f"{head}{BEGIN}\n\n{generated}\n\n{END}{tail}"
-
-
-def short_name(env_id: str) -> str:
-    """What the files about a Dora id are called: DoraCube-v1 -> cube."""
-    return env_id.removeprefix("Dora").split("-")[0].lower()
 
 
 def page_of(env_id: str, docs: Path) -> Path:

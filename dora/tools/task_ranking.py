@@ -19,7 +19,7 @@ from dora.affordance.objects.catalogue import load_object
 from dora.affordance.search.optimise import OFF_TABLE
 from dora.parallel import run_cases
 from dora.tasks import make_task
-from dora.tasks.env.base import DoraEnv
+from dora.tasks.env.env import DoraEnv
 
 TASKS = {"cube": "DoraCube-v1", "jug": "DoraJug-v1", "hammer": "DoraHammer-v1"}
 """The task in which the grasps of an object are executed."""
@@ -125,7 +125,7 @@ def _executed(task: DoraEnv, seed: int) -> Bool[Tensor, " n"]:
     for _ in range(task.max_steps):
         *_, info = task.step(task.scripted_action())
         failed |= info["fail"]
-    return info["success"] & ~failed & (task.episode.max_penetration <= CLEAN * task.PENETRATION_LIMIT)
+    return info["success"] & ~failed & (task.memory.max_penetration <= CLEAN * task.config.penetration_limit)
 
 
 def ranked(candidates: GraspCandidates, proof: TaskRanking) -> GraspCandidates:
@@ -161,7 +161,7 @@ class _Usable:
         task = self._task
         task.guide.choice.candidates = candidates.to(task.device)
         pose = task.target_object.pose
-        return (task.reachable(pose.p, pose.q).float().mean(0) >= USABLE).cpu()
+        return (task.task.reachable(task.arm, pose.p, pose.q).float().mean(0) >= USABLE).cpu()
 
 
 def rank_bundled_set(name: str, phase: Callable[[str], Callable[[int, int], None]]) -> Path:
@@ -199,7 +199,7 @@ def bundle_feasibility_tables() -> list[Path]:
     kept = []
     for env_id in TASKS.values():
         task = make_task(env_id, 1)
-        table = task.reach_table
+        table = task.arm.reach_table
         task.close()
         if table is not None:
             kept.append(data_folder() / f"reach-{table.digest[:16]}.safetensors")

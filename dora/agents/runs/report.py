@@ -44,7 +44,7 @@ class Run:
     @property
     def group(self) -> Group:
         """Runs that differ only in their seed share it; guidance names its parts if the run did."""
-        task = self.result.get("task", {})
+        task = self.result if "preset" in self.result else self.result.get("task", {})
         parts = task.get("guidance_parts")
         guidance = self.result["guidance"] + (f" ({', '.join(parts)})" if parts else "")
         thousands = round(self.result["env_steps"] / 1000)

@@ -3,13 +3,16 @@
 import dataclasses
 import importlib.metadata
 import platform
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+import dora
 from dora.agents.config import RunConfig, config_from_dict
 from dora.agents.evaluation.evaluate import Evaluation
+from dora.configs import plain
 from dora.errors import InputError
 from dora.files import write_bytes, write_csv, write_json
 
@@ -79,22 +82,23 @@ class RunFolder:
 
     def write_config(self, config: RunConfig) -> None:
         """Write `config.yaml`."""
-        content = dataclasses.asdict(config)
-        content["learner"]["hidden"] = list(content["learner"]["hidden"])
-        write_bytes(self.path / "config.yaml", yaml.safe_dump(content, sort_keys=False).encode())
+        write_bytes(self.path / "config.yaml", yaml.safe_dump(plain(config), sort_keys=False).encode())
 
     def read_config(self) -> RunConfig:
         """Settings of the run.
 
         Raises:
-            InputError: if this is not a run folder.
+            InputError: if this is not a run folder, or its settings do not fit this version.
         """
         try:
-            return config_from_dict(yaml.safe_load((self.path / "config.yaml").read_text()))
-        except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+            content = yaml.safe_load((self.path / "config.yaml").read_text())
+        except (OSError, yaml.YAMLError, ValueError) as error:
             raise InputError(
                 f"{self.path} is not a run folder (no readable config.yaml): give one that a run printed."
             ) from error
+        if not isinstance(content, dict):
+            raise InputError(f"{self.path / 'config.yaml'} holds no settings: give a folder that a run printed.")
+        return config_from_dict(content)
 
     def write_curve(self, rows: list[list[Any]]) -> None:
         """Write `curve.csv`."""
@@ -126,6 +130,8 @@ def make_result(
         "env": config.env,
         "agent": config.agent,
         "guidance": config.guidance,
+        "guidance_parts": config.task_options["guidance_parts"],
+        "preset": config.preset,
         "seed": config.seed,
         "env_steps": env_steps,
         "wall_seconds": round(wall_seconds, 3),
@@ -142,12 +148,26 @@ def make_result(
         "finished": finished,
         "eval_episodes": len(some.table) if some else 0,
         "penetration_p95_mm": some.penetration_p95_mm if some else None,
-        "task": config.task,
+        "commit": source_commit(),
+        "task_config": config.task,
     }
+
+
+def source_commit() -> str | None:
+    """Commit of the checkout that runs, with "-dirty" if files of it have changed; None for an installed package."""
+    root = Path(dora.__file__).parents[1]
+    if not (root / ".git").exists():
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
 
 
 def _versions() -> str:
     lines = [f"python {platform.python_version()}", f"platform {platform.platform()}"]
+    lines += [f"commit {commit}"] if (commit := source_commit()) else []
     for name in PACKAGES:
         try:
             lines.append(f"{name} {importlib.metadata.version(name)}")

@@ -23,13 +23,13 @@ def check_action(env: Any, action: Any) -> None:
     """
     if isinstance(action, Mapping) and "control_mode" in action:
         if action["control_mode"] == env.agent.control_mode:
-            _check_array(action.get("action"), env._orig_single_action_space, env.num_envs, "")
+            check_array(action.get("action"), env._orig_single_action_space, env.num_envs, "")
         else:
             _check_finite(action.get("action"), "")
     elif isinstance(action, Mapping):
         _check_robots(env, action)
     elif isinstance(action, np.ndarray | torch.Tensor):
-        _check_array(action, env._orig_single_action_space, env.num_envs, "")
+        check_array(action, env._orig_single_action_space, env.num_envs, "")
 
 
 def _check_robots(env: Any, action: Mapping[str, Any]) -> None:
@@ -42,10 +42,11 @@ def _check_robots(env: Any, action: Mapping[str, Any]) -> None:
     if action.keys() != space.spaces.keys():
         raise InputError(f"The action has keys {sorted(action)} but the robots are {sorted(space.spaces)}.")
     for name, part in action.items():
-        _check_array(part, space[name], env.num_envs, f" of {name}")
+        check_array(part, space[name], env.num_envs, f" of {name}")
 
 
-def _check_array(action: Any, space: Any, environments: int, whose: str) -> None:
+def check_array(action: Any, space: Any, environments: int, whose: str = "") -> None:
+    """Check an array of actions (environments, dimension) of a space of one action; InputError as `check_action`."""
     if isinstance(space, spaces.Dict):
         raise InputError(f"There are several robots: pass a dictionary of actions for {sorted(space.spaces)}.")
     shape, single = tuple(np.shape(action)), tuple(space.shape)

@@ -1,34 +1,20 @@
 """The options that every Dora task takes, checked before anything is built."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from mani_skill.agents.registration import REGISTERED_AGENTS
 
+from dora.configs import overridden
 from dora.errors import InputError
 from dora.robot import available_robots
 from dora.sim.batch.rendering import can_render
 from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot, register_robot
+from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import guidance_in_force
-from dora.tasks.mdp.randomisation import Randomisation, find_preset
-
-
-def choose_render_backend(render_mode: str | None, obs_mode: str | None) -> str:
-    """The render backend for a task: "none" unless a picture can be asked for.
-
-    Raises:
-        InputError: if one can be asked for and there is no Vulkan driver.
-    """
-    if render_mode is None and obs_mode in (None, "state", "state_dict", "none"):
-        return "none"
-    if not can_render():
-        raise InputError(
-            "rendering was asked for, but SAPIEN finds no Vulkan driver: install one (docs/rendering.md), or leave "
-            'render_mode at None and obs_mode at "state"'
-        )
-    return "gpu" if torch.cuda.is_available() else "cpu"
+from dora.tasks.mdp.randomisation import find_preset
 
 
 @dataclass(frozen=True)
@@ -36,19 +22,39 @@ class TaskOptions:
     """Checked options of a task, with what they resolve to."""
 
     parts: frozenset[str]
-    preset: Randomisation
-    robot: str
+    config: TaskConfig
+    robots: tuple[str, ...]
     control_mode: str
     sim_backend: str
     render_backend: str
+
+
+def task_config(cls: type[TaskConfig], preset: str, changes: Mapping[str, Any] | TaskConfig | None) -> TaskConfig:
+    """The numbers of a task: its own, the preset's randomisation, then `changes`.
+
+    Raises:
+        InputError: for an unknown preset, an unknown name, a value of the wrong type, or rates that do not fit.
+    """
+    base: TaskConfig = replace(cls(), randomisation=find_preset(preset))
+    config = overridden(base, changes or {}, "config")
+    for name in ("control_frequency", "physics_frequency", "solver_iterations"):
+        if getattr(config, name) < 1:
+            raise InputError(f"config.{name} is {getattr(config, name)}; it has to be at least 1.")
+    if config.physics_frequency % config.control_frequency:
+        raise InputError(
+            f"config.physics_frequency is {config.physics_frequency} Hz; it has to be a multiple of "
+            f"config.control_frequency, {config.control_frequency} Hz."
+        )
+    return config
 
 
 def check_options(
     guidance: str,
     guidance_parts: Sequence[str] | None,
     hand_joints: int,
-    preset: str,
+    config: TaskConfig,
     robot_uids: Any,
+    arms: int,
     num_envs: int,
     control_mode: str | None,
     sim_backend: str,
@@ -71,12 +77,7 @@ def check_options(
         )
     if not isinstance(num_envs, int) or num_envs < 1:
         raise InputError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
-    if not isinstance(robot_uids, str):
-        raise InputError(f"robot_uids must be one of {', '.join(available_robots())}, not {robot_uids!r}")
-    if robot_uids not in REGISTERED_AGENTS:
-        register_robot(robot_uids)
-    if not issubclass(REGISTERED_AGENTS[robot_uids].agent_cls, DescribedRobot):
-        raise InputError(f"robot {robot_uids!r} has no hand for this task; use one of {', '.join(available_robots())}")
+    robots = _robots(robot_uids, arms)
     mode = control_mode or CONTROL_MODES[0]
     if hand_joints == 15 and not mode.endswith(COUPLED):
         mode += COUPLED
@@ -87,4 +88,36 @@ def check_options(
         sim_backend = "physx_cpu_batch" if num_envs > 1 else "physx_cpu"
     if render_backend == "auto":
         render_backend = choose_render_backend(render_mode, obs_mode)
-    return TaskOptions(parts, find_preset(preset), robot_uids, mode, sim_backend, render_backend)
+    return TaskOptions(parts, config, robots, mode, sim_backend, render_backend)
+
+
+def _robots(robot_uids: Any, arms: int) -> tuple[str, ...]:
+    """Names of the robots of `arms` arms, registered with ManiSkill; one name stands for all."""
+    names = robot_uids if isinstance(robot_uids, tuple | list) else (robot_uids,) * arms
+    known = ", ".join(available_robots())
+    if len(names) != arms:
+        raise InputError(f"robot_uids must name one robot for each of {arms} arms, not {len(names)}")
+    for name in names:
+        if not isinstance(name, str):
+            raise InputError(f"robot_uids must be one of {known}, not {name!r}")
+        if name not in REGISTERED_AGENTS:
+            register_robot(name)
+        if not issubclass(REGISTERED_AGENTS[name].agent_cls, DescribedRobot):
+            raise InputError(f"robot {name!r} has no hand for this task; use one of {known}")
+    return tuple(names)
+
+
+def choose_render_backend(render_mode: str | None, obs_mode: str | None) -> str:
+    """The render backend for a task: "none" unless a picture can be asked for.
+
+    Raises:
+        InputError: if one can be asked for and there is no Vulkan driver.
+    """
+    if render_mode is None and obs_mode in (None, "state", "state_dict", "none"):
+        return "none"
+    if not can_render():
+        raise InputError(
+            "rendering was asked for, but SAPIEN finds no Vulkan driver: install one (docs/rendering.md), or leave "
+            'render_mode at None and obs_mode at "state"'
+        )
+    return "gpu" if torch.cuda.is_available() else "cpu"

@@ -1,10 +1,12 @@
-"""What a preset does to an episode while it runs: noise in what is observed, delayed actions, pushes.
+"""What the randomisation does to an episode while it runs: noise in what is observed, delayed actions, pushes.
 
 All random numbers of an episode follow from one key, which is drawn from the environment's own stream at reset, and
 from the number of the control step. So they neither depend on the other environments nor on when they are asked for,
 and a restored state sees the same noise as the one that was saved.
 """
 
+from collections.abc import Mapping
+from dataclasses import replace
 from math import pi
 
 import torch
@@ -12,18 +14,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
-from dora.tasks.guidance.candidate_choice import Choice
+from dora.tasks.guidance.candidate_choice import CandidateChoice
+from dora.tasks.mdp.buffers import Buffers
 from dora.tasks.mdp.randomisation import Randomisation
 from dora.tasks.mdp.snapshot import S, observed
 
 KEYS = 2**24
-"""Number of different keys; each is exact in a float, as which states are stored."""
+"""Number of different keys [1]; each is exact in a float, as which states are stored."""
 WORD = 2**32 - 1
 """Mask of 32 bits."""
 GOLDEN = 0x9E3779B9
 """2^32 over the golden ratio: multiples of it are spread evenly."""
-SENSOR_DRAWS, PUSH_DRAWS = 26, 2
-"""Random numbers of a control step: object position 3, rotation 3, hand joints 20; whether and where to push."""
+OBJECT_DRAWS, PUSH_DRAWS = 6, 2
+"""Random numbers of a control step: position and rotation of each object; whether and where to push it."""
 
 
 def _mixed(word: Tensor) -> Tensor:
@@ -44,67 +47,77 @@ class Perturbations:
     """Noise, delay and pushes of n environments.
 
     Args:
-        preset: how strong they are.
+        randomisation: how strong they are.
         num_envs: n.
         action_size: components of an action.
-        frequency: control steps in a second [Hz].
+        hands: number of hand joints of each arm.
+        dt: duration of a control step [s].
         device: where the tensors are.
     """
 
-    def __init__(self, preset: Randomisation, num_envs: int, action_size: int, frequency: int, device: torch.device):
-        self.preset, self._frequency = preset, frequency
-        self.buffers = {
-            "key": torch.zeros(num_envs, device=device),
-            "waiting": torch.zeros(num_envs, max(preset.delay, 1), action_size, device=device),
-        }
+    def __init__(
+        self,
+        randomisation: Randomisation,
+        num_envs: int,
+        action_size: int,
+        hands: Mapping[str, int],
+        dt: float,
+        device: torch.device | str,
+    ):
+        self.randomisation, self._dt = randomisation, dt
+        self._sensors = {arm: OBJECT_DRAWS + size for arm, size in hands.items()}
+        self.buffers = Buffers(num_envs, device, key=(), waiting=(max(randomisation.delay, 1), action_size))
 
     def begin(self, rows: Int[Tensor, " b"], share: Float[Tensor, " b"]) -> None:
         """Starts new episodes in the environments `rows`; `share` in [0, 1) chooses their keys."""
-        self.buffers["key"][rows] = (share * KEYS).floor()
+        self.buffers.write(rows, key=(share * KEYS).floor())
 
     def _draws(self, step: Tensor, start: int, size: int) -> Tensor:
-        return uniform(self.buffers["key"].long(), step.long(), start + size)[:, start:]
+        return uniform(self.buffers.key.long(), step.long(), start + size)[:, start:]
 
     def delayed(self, action: Float[Tensor, "n a"], step: Int[Tensor, " n"]) -> Float[Tensor, "n a"]:
         """Takes in the action of a control step; the one that takes effect now. The first acts at once."""
-        if self.preset.delay == 0:
+        if self.randomisation.delay == 0:
             return action
-        waiting = self.buffers["waiting"]
+        waiting = self.buffers.waiting
         waiting.copy_(torch.where((step == 0)[:, None, None], action[:, None], waiting))
         now = waiting[:, 0].clone()
         waiting.copy_(torch.cat([waiting[:, 1:], action[:, None]], 1))
         return now
 
-    def pushes(self, step: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-        """Impulse on each object in this control step [N s], world frame; zero in most."""
-        if self.preset.push == 0:
-            return torch.zeros(len(step), 3, device=step.device)
-        chance, where = self._draws(step, SENSOR_DRAWS, PUSH_DRAWS).unbind(-1)
-        size = self.preset.push * (chance < self.preset.push_rate / self._frequency)
+    def pushes(self, step: Int[Tensor, " n"], count: int = 1) -> Float[Tensor, "n {count} 3"]:
+        """Impulses on `count` objects in this control step [N s], world frame; zero in most."""
+        r = self.randomisation
+        if r.push == 0:
+            return torch.zeros(len(step), count, 3, device=step.device)
+        draws = self._draws(step, sum(self._sensors.values()), PUSH_DRAWS * count)
+        chance, where = draws.reshape(len(step), count, PUSH_DRAWS).unbind(-1)
+        size = r.push * (chance < r.push_rate * self._dt)
         angle = 2 * pi * where
         return torch.stack([size * angle.cos(), size * angle.sin(), torch.zeros_like(size)], -1)
 
-    def observed(self, s: S, choice: Choice, step: Int[Tensor, " n"]) -> S:
-        """The state as it is observed: object pose, all that follows from it, and hand joints are noisy."""
-        preset = self.preset
-        if not preset.noisy:
+    def observed(self, s: S, choices: Mapping[str, CandidateChoice], step: Int[Tensor, " n"]) -> S:
+        """The state as it is observed: poses of handled objects, all that follows from them, and hand joints are noisy.
+
+        Args:
+            s: the true state.
+            choices: candidates of each arm.
+            step: number of the control step in its episode.
+        """
+        r = self.randomisation
+        if not r.noisy:
             return s
-        error = 2 * self._draws(step, 0, SENSOR_DRAWS) - 1
-        position = s.object_p + preset.observed_position * error[:, :3]
-        tilt = quaternion_from_rotation_vector(preset.observed_rotation * error[:, 3:6])
-        quaternion = quaternion_multiply(s.object_q, tilt)
-        near_p, near_q, approach = choice.goals(position, quaternion)
-        return observed(
-            s,
-            object_p=position, object_q=quaternion, hand_q=s.hand_q + preset.observed_joint * error[:, 6:],
-            near_p=near_p, near_q=near_q, goal_p=near_p[:, 0], goal_q=near_q[:, 0], goal_approach=approach,
-        )  # fmt: skip
-
-    def get_state(self) -> dict[str, Tensor]:
-        """Copies of all buffers by name."""
-        return {name: buffer.clone() for name, buffer in self.buffers.items()}
-
-    def set_state(self, state: dict[str, Tensor], rows: Tensor | slice) -> None:
-        """Inverse of `get_state` for the given rows."""
-        for name, buffer in self.buffers.items():
-            buffer[rows] = state[name].reshape(buffer[rows].shape)
+        errors = (2 * self._draws(step, 0, sum(self._sensors.values())) - 1).split(list(self._sensors.values()), -1)
+        hands, objects, goals = dict(s.hands), dict(s.objects), dict(s.goals)
+        for arm, error in zip(self._sensors, errors, strict=True):
+            body, name = s.objects[s.handles[arm]], s.handles[arm]
+            position = body.p + r.observed_position * error[:, :3]
+            tilt = quaternion_from_rotation_vector(r.observed_rotation * error[:, 3:6])
+            quaternion = quaternion_multiply(body.q, tilt)
+            near_p, near_q, approach = choices[arm].goals(position, quaternion)
+            objects[name] = replace(body, p=position, q=quaternion)
+            hands[arm] = replace(s.hands[arm], q=s.hands[arm].q + r.observed_joint * error[:, OBJECT_DRAWS:])
+            goals[arm] = replace(
+                s.goals[arm], p=near_p[:, 0], q=near_q[:, 0], approach=approach, near_p=near_p, near_q=near_q
+            )
+        return observed(s, hands, objects, goals)

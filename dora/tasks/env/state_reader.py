@@ -1,116 +1,181 @@
-"""The only place where a task reads the simulator."""
+"""The only place where a task reads the simulator: bodies, joints and contacts, into memory and snapshot."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Link
 from torch import Tensor
 
 from dora.geometry.rotations import quaternion_apply, quaternion_inverse
 from dora.sim.bodies import BodyReader
-from dora.sim.contacts import ContactMonitor, Contacts
+from dora.sim.contacts import ContactMonitor
 from dora.sim.robot_agent import DescribedRobot
-from dora.tasks.env.episode_memory import Episode
-from dora.tasks.guidance.grasp_and_lift import Guide
-from dora.tasks.mdp.snapshot import CONTACT_CLASSES, FINGERS, Snapshot
+from dora.tasks.guidance.guide import Guide
+from dora.tasks.mdp.memory import EpisodeMemory
+from dora.tasks.mdp.snapshot import CONTACT_CLASSES, GoalState, HandState, ObjectState, Snapshot
 from dora.tasks.mdp.stages import StageMachine
 
-TIPS = slice(1, 1 + len(FINGERS))
-"""Places of the distal links among the bodies whose poses are read: after the wrist, before the object."""
+WORLD = "world"
+"""Name of the group of everything else that hands and objects may touch."""
 
 
-class SimulatorReader:
-    """Reads the robot and the manipulated object of a built scene; make a new one after a reconfiguration.
+class StateReader:
+    """Reads the robots and the objects of a built scene; make a new one after a reconfiguration.
 
     Args:
         scene: the scene of all environments.
-        agent: the robot.
-        target: the manipulated object.
-        world: what the object and the hand may touch besides each other.
-        points: contact points of hand and object that are wanted; 0 if nobody asks for them.
+        agents: the robot of each arm.
+        objects: by their names.
+        handles: name of the object that each arm handles.
+        world: what objects and hands may touch besides each other.
+        points: contact points of each hand with its object that are wanted; 0 if nobody asks for them.
         every_step: collect contacts from all physics steps of a control step, not from the last one only.
     """
 
     def __init__(
         self,
         scene: ManiSkillScene,
-        agent: DescribedRobot,
-        target: Actor,
+        agents: Mapping[str, DescribedRobot],
+        objects: Mapping[str, Actor],
+        handles: Mapping[str, str],
         world: Sequence[Actor | Link],
         points: int = 0,
         every_step: bool = False,
     ):
-        self._agent = agent
-        self._poses = BodyReader(scene, [agent.wrist, *agent.distals, target])
-        self._velocities = BodyReader(scene, [agent.wrist, target])
-        parts = dict(zip(FINGERS, agent.finger_links, strict=True)) | {"palm": [agent.palm]}
-        pairs = [(part, other) for part in parts for other in ("object", "world")] + [("object", "world")]
-        located = [(part, "object") for part in parts] if points else []
-        groups = parts | {"object": [target], "world": list(world)}
+        self._agents, self._handles, self._names = dict(agents), dict(handles), tuple(objects)
+        self._joints = {
+            arm: tuple(torch.tensor(index, device=scene.device) for index in (agent.arm_index, agent.hand_index))
+            for arm, agent in agents.items()
+        }
+        hands = [body for agent in agents.values() for body in (agent.wrist, *agent.distals)]
+        self._poses = BodyReader(scene, [*hands, *objects.values()])
+        self._velocities = BodyReader(scene, [*(agent.wrist for agent in agents.values()), *objects.values()])
+        parts = {arm: _parts(arm, agent) for arm, agent in agents.items()}
+        groups = {name: members for part in parts.values() for name, members in part.items()}
+        self._part_count = len(groups)
+        others = [*objects, WORLD]
+        pairs = [(part, other) for part in groups for other in others] + [(name, WORLD) for name in objects]
+        located = [(part, handles[arm]) for arm in agents for part in parts[arm]] if points else []
+        groups |= {name: [body] for name, body in objects.items()} | {WORLD: list(world)}
         self._contacts = ContactMonitor(scene, groups, pairs, located, every_step)
-        self._points = points
-        classes = [CONTACT_CLASSES.index(name) if name in CONTACT_CLASSES else 0 for name in groups]
-        self._classes = torch.tensor([0, *classes], device=scene.device)  # the first for an empty row
-        self._arm_index = torch.tensor(agent.arm_index, device=scene.device)
-        self._hand_index = torch.tensor(agent.hand_index, device=scene.device)
+        self.points = points * len(agents)
+        """Rows of contact points of each hand: those of the other hands are empty."""
+        self._rows = {arm: [list(groups).index(part) for part in parts[arm]] for arm in agents}
+        classes = [name.rpartition(".")[2] for name in groups]
+        known = [CONTACT_CLASSES.index(name) if name in CONTACT_CLASSES else 0 for name in classes]
+        self._classes = torch.tensor([0, *known], device=scene.device)  # the first for an empty row
 
-    def contacts(self) -> Contacts:
-        """Contacts among the fingers, the palm, the object and the world, in this order: of the last physics step, or
-        of all steps since the last call."""
-        return self._contacts.take()
+    def record(self, memory: EpisodeMemory, frequency: float) -> None:
+        """Writes the contacts of the last control step into the memory.
 
-    def points(self) -> tuple[Float[Tensor, "n m 3"], Int[Tensor, "n m"]]:
-        """Contact points of the hand on the object in the last physics step, object frame [m], and what touches
-        there: a place in `CONTACT_CLASSES`, 0 in empty rows."""
-        world, group = self._contacts.points(self._points)
-        pose = self._poses.poses()[:, -1:].expand(-1, self._points, 7)
-        local = quaternion_apply(quaternion_inverse(pose[..., 3:]), world - pose[..., :3])
-        return torch.where((group >= 0)[..., None], local, 0.0), self._classes[group + 1]
+        Args:
+            memory: of the episode.
+            frequency: 1 / the time over which impulses were collected [Hz]: a physics step, or all of a control step.
+        """
+        contacts, count = self._contacts.take(), self._part_count
+        depth = (-contacts.separation).clamp(min=0)
+        hands = depth[:, :count, count:].flatten(1).amax(-1)
+        memory.record_penetration(torch.maximum(hands, depth[:, count:-1, -1].amax(-1)))
+        for arm, rows in self._rows.items():
+            column = count + self._names.index(self._handles[arm])
+            force = contacts.impulse[:, rows[0] : rows[-1] + 1, column].norm(dim=-1) * frequency
+            memory.hands[arm].update(force=force, touch=force > 0)
+        for k, name in enumerate(self._names):
+            memory.objects[name].update(supported=contacts.impulse[:, count + k, -1].square().sum(-1) > 0)
+        if self.points:
+            self._record_points(memory)
+
+    def _record_points(self, memory: EpisodeMemory) -> None:
+        """Contact points of each hand with its object in the last physics step, in the object's frame."""
+        world, group = self._contacts.points(self.points)
+        poses = self._poses.poses()[:, -len(self._names) :]
+        for arm, rows in self._rows.items():
+            pose = poses[:, self._names.index(self._handles[arm]), None].expand(-1, self.points, 7)
+            local = quaternion_apply(quaternion_inverse(pose[..., 3:]), world - pose[..., :3])
+            mine = (group >= rows[0]) & (group <= rows[-1])
+            memory.hands[arm].update(
+                contact_p=torch.where(mine[..., None], local, 0.0),
+                contact_finger=torch.where(mine, self._classes[group + 1], 0),
+            )
 
     def snapshot(
         self,
         machine: StageMachine,
-        guide: Guide,
-        episode: Episode,
-        object_half: Float[Tensor, "n 3"],
+        guides: Mapping[str, Guide],
+        memory: EpisodeMemory,
+        halves: Mapping[str, Float[Tensor, "n 3"]],
         time: Float[Tensor, " n"],
     ) -> Snapshot:
         """The state now.
 
         Args:
             machine: stages of the task.
-            guide: candidates, phase and correction.
-            episode: what the episode remembers, its contacts being up to date.
-            object_half: half extents of the object [m].
+            guides: candidates, phase and residual of each arm.
+            memory: what the episode remembers, its contacts being up to date.
+            halves: half extents of each object [m].
             time: share of the episode that is over.
         """
         pose, velocity = self._poses.poses(), self._velocities.velocities()
-        p, q, v, w = pose[..., :3], pose[..., 3:], velocity[..., :3], velocity[..., 3:]
-        qpos, qvel = self._agent.robot.get_qpos(), self._agent.robot.get_qvel()
-        tip_p, tip_q = self._agent.tips_of(p[:, TIPS], q[:, TIPS])
-        hand_q, e, chosen = qpos[:, self._hand_index], episode, guide.choice.buffers
-        near_p, near_q, approach = guide.choice.goals(p[:, -1], q[:, -1])
+        objects, hands, goals, body, wrist = {}, {}, {}, 0, 0
+        first, arms = pose.shape[1] - len(self._names), len(self._agents)
+        for k, name in enumerate(self._names):
+            m = memory.objects[name]
+            objects[name] = ObjectState(
+                p=pose[:, first + k, :3], q=pose[:, first + k, 3:], v=velocity[:, arms + k, :3],
+                w=velocity[:, arms + k, 3:], half=halves[name], start_p=m.start_p.clone(), supported=m.supported > 0,
+            )  # fmt: skip
+        for arm, agent in self._agents.items():
+            last = body + 1 + len(agent.distals)
+            hands[arm] = self._hand(agent, memory, arm, pose[:, body:last], velocity[:, wrist])
+            goals[arm] = _goal(guides[arm], objects[self._handles[arm]])
+            body, wrist = last, wrist + 1
+        e = memory.episode
         return Snapshot(
-            arm_q=qpos[:, self._arm_index], hand_q=hand_q, hand_v=qvel[:, self._hand_index],
-            hand_target=self._hand_target(hand_q),
-            wrist_p=p[:, 0], wrist_q=q[:, 0], wrist_v=v[:, 0], wrist_w=w[:, 0], tip_p=tip_p, tip_q=tip_q,
-            object_p=p[:, -1], object_q=q[:, -1], object_v=v[:, -1], object_w=w[:, -1],
-            object_half=object_half, start_p=e.start_p.clone(),
-            touch=e.touch > 0, force=e.force.clone(), supported=e.supported > 0,
+            hands=hands, objects=objects, goals=goals, handles=self._handles,
             penetration=e.penetration.clone(), max_penetration=e.max_penetration.clone(),
             stage=machine.index.clone(), time=time,
             action=e.action.clone(), previous_action=e.previous_action.clone(),
-            goal_p=near_p[:, 0], goal_q=near_q[:, 0], goal_approach=approach, near_p=near_p, near_q=near_q,
-            goal_pregrasp=chosen["pregrasp"].clone(), goal_grasp=chosen["grasp"].clone(),
-            phase=guide.reference.one_hot(), correction=guide.correction.value.clone(),
-            contact_p=e.contact_p.clone(), contact_finger=e.contact_finger.long(),
         )  # fmt: skip
 
-    def _hand_target(self, measured: Tensor) -> Tensor:
-        """Commanded hand joints; the measured ones before the first command and in other control modes."""
-        if not self._agent.commands_wrist:
-            return measured
-        controller = self._agent.wrist_controller
-        return controller.target[:, controller.arm_size :] if len(controller.target) else measured
+    def _hand(
+        self, agent: DescribedRobot, memory: EpisodeMemory, arm: str, pose: Tensor, velocity: Tensor
+    ) -> HandState:
+        """One hand from poses of wrist and distal links (n, 1 + fingers, 7), and the wrist's velocity (n, 6)."""
+        qpos, qvel, m = agent.robot.get_qpos(), agent.robot.get_qvel(), memory.hands[arm]
+        tip_p, tip_q = agent.tips_of(pose[:, 1:, :3], pose[:, 1:, 3:])
+        arm_index, hand_index = self._joints[arm]
+        hand_q = qpos[:, hand_index]
+        return HandState(
+            arm_q=qpos[:, arm_index], q=hand_q, v=qvel[:, hand_index], target=_hand_target(agent, hand_q),
+            wrist_p=pose[:, 0, :3], wrist_q=pose[:, 0, 3:], wrist_v=velocity[:, :3], wrist_w=velocity[:, 3:],
+            tip_p=tip_p, tip_q=tip_q, tip_radius=agent.description.tip_radius,
+            touch=m.touch > 0, force=m.force.clone(),
+            contact_p=m.contact_p.clone(), contact_finger=m.contact_finger.long(),
+        )  # fmt: skip
+
+
+def _goal(guide: Guide, body: ObjectState) -> GoalState:
+    """What the candidates of one arm ask for at the object's pose."""
+    near_p, near_q, approach = guide.choice.goals(body.p, body.q)
+    chosen = guide.choice.buffers
+    return GoalState(
+        p=near_p[:, 0], q=near_q[:, 0], approach=approach, near_p=near_p, near_q=near_q,
+        pregrasp=chosen.pregrasp.clone(), grasp=chosen.grasp.clone(),
+        phase=guide.reference.one_hot(), residual=guide.residual.buffers.residual.clone(),
+    )  # fmt: skip
+
+
+def _parts(arm: str, agent: DescribedRobot) -> dict[str, list[Link]]:
+    """Groups of one hand whose contacts are told apart: the fingers, then the palm, as `<arm>.<part>`."""
+    fingers = zip(agent.description.fingers, agent.finger_links, strict=True)
+    return {f"{arm}.{name}": links for name, links in fingers} | {f"{arm}.palm": [agent.palm]}
+
+
+def _hand_target(agent: DescribedRobot, measured: Tensor) -> Tensor:
+    """Commanded hand joints; the measured ones before the first command and in control modes of joints."""
+    if not agent.commands_wrist:
+        return measured
+    controller = agent.wrist_controller
+    return controller.target[:, controller.arm_size :] if len(controller.target) else measured

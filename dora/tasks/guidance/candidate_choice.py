@@ -5,12 +5,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
+from dora.geometry.poses import carried
 from dora.geometry.rotations import (
     quaternion_apply,
     quaternion_from_rotation_vector,
     quaternion_multiply,
     rotation_angle,
 )
+from dora.tasks.mdp.buffers import Buffers
 from dora.tasks.mdp.randomisation import Randomisation
 
 NEAREST = 3
@@ -21,48 +23,31 @@ SCORE_MARGIN = 0.1
 """Candidates whose score is at most this much below the best reachable one's count as well ranked."""
 UNRANKED, UNREACHABLE = 1e3, 1e6
 """Distances added to candidates that are ranked lower or cannot be reached [m]; larger than any real one."""
-ERROR_DRAWS = 26
-"""Random numbers of the candidates' error: 3 position, 3 rotation, 20 joints."""
 
 
-def in_world(
-    position: Float[Tensor, "*#b k 3"],
-    quaternion: Float[Tensor, "*#b k 4"],
-    object_p: Float[Tensor, "b 3"],
-    object_q: Float[Tensor, "b 4"],
-) -> tuple[Float[Tensor, "b k 3"], Float[Tensor, "b k 4"]]:
-    """World wrist poses of k grasps, the same for all objects or k of each, given in the frames of b objects [m]."""
-    each = object_q[:, None].expand(-1, position.shape[-2], 4)
-    return (
-        object_p[:, None] + quaternion_apply(each, position.expand(len(each), -1, 3)),
-        quaternion_multiply(each, quaternion.expand(len(each), -1, 4)),
-    )
-
-
-class Choice:
+class CandidateChoice:
     """The candidates in use, one row per environment; poses in the object frame, the error included.
 
     All k candidates of an environment have the same error, as a misplaced object frame would cause.
 
     Attributes:
-        error_scale: share of the preset's candidate error in force, for curricula.
+        error_scale: share of the randomisation's candidate error in force, for curricula.
+        error_draws: random numbers of an environment's error: 3 position, 3 rotation, one per hand joint.
         buffers: `position` (n, k, 3) [m], `quaternion` (n, k, 4), of the k nearest; of the first one `approach`
-            (n, 3), `pregrasp` and `grasp` (n, 20) [rad]; `reachable` (n,), 0 where no candidate can be reached.
+            (n, 3), `pregrasp` and `grasp` (n, hand) [rad]; `reachable` (n,), 0 where no candidate can be reached.
     """
 
     def __init__(self, candidates: GraspCandidates, num_envs: int, device: torch.device):
         self.candidates = candidates.to(device)
         self._score = torch.nan_to_num(self.candidates.score, nan=0.0)
         self.error_scale = 1.0
-
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(num_envs, *shape, device=device)
-
-        self.buffers = {
-            "position": zeros(NEAREST, 3), "quaternion": zeros(NEAREST, 4), "approach": zeros(3),
-            "pregrasp": zeros(20), "grasp": zeros(20), "reachable": zeros(),
-        }  # fmt: skip
-        self.buffers["quaternion"][..., 0] = 1.0
+        hand = self.candidates.grasp.shape[1]
+        self.error_draws = 6 + hand
+        self.buffers = Buffers(
+            num_envs, device, position=(NEAREST, 3), quaternion=(NEAREST, 4), approach=(3,), pregrasp=(hand,),
+            grasp=(hand,), reachable=(),
+        )  # fmt: skip
+        self.buffers.quaternion[..., 0] = 1.0
 
     def nearest(
         self,
@@ -75,7 +60,7 @@ class Choice:
         """Indices of the k best candidates: reachable before unreachable, well ranked before lower ones, then by
         distance from the wrist. With fewer than k reachable ones, the first is repeated."""
         b, count = len(object_p), len(self.candidates)
-        goal_p, goal_q = in_world(self.candidates.position, self.candidates.quaternion, object_p, object_q)
+        goal_p, goal_q = carried(self.candidates.position, self.candidates.quaternion, object_p, object_q)
         away = (goal_p - wrist_p[:, None]).norm(dim=-1)
         turn = rotation_angle(goal_q, wrist_q[:, None].expand(b, count, 4))
         score = torch.where(reachable, self._score, -1.0)
@@ -87,26 +72,25 @@ class Choice:
 
     def choose(
         self, rows: Int[Tensor, " b"], index: Int[Tensor, "b k"], reachable: Bool[Tensor, " b"],
-        error: Float[Tensor, "b 26"], preset: Randomisation,
+        error: Float[Tensor, "b e"], randomisation: Randomisation,
     ) -> None:  # fmt: skip
-        """Gives the environments `rows` the candidates `index`, with the preset's error.
+        """Gives the environments `rows` the candidates `index`, with an error as `randomisation` says.
 
-        `error` are independent uniform numbers in [-1, 1]: 3 for position, 3 for rotation, 20 for the joints;
+        `error`: `error_draws` independent uniform numbers in [-1, 1]: 3 for position, 3 for rotation, then joints;
         `reachable` says whether the first candidate can be reached.
         """
         c, first, error = self.candidates, index[:, 0], self.error_scale * error
-        tilt = quaternion_from_rotation_vector(preset.candidate_rotation * error[:, 3:6])
-        bend = preset.candidate_joint * error[:, 6:]
-        values = {
-            "position": c.position[index] + preset.candidate_position * error[:, None, :3],
-            "quaternion": quaternion_multiply(c.quaternion[index], tilt[:, None].expand(-1, NEAREST, 4)),
-            "approach": c.approach[first],
-            "pregrasp": c.pregrasp[first] + bend,
-            "grasp": c.grasp[first] + bend,
-            "reachable": reachable.float(),
-        }
-        for name, buffer in self.buffers.items():
-            buffer[rows] = values[name]
+        tilt = quaternion_from_rotation_vector(randomisation.candidate_rotation * error[:, 3:6])
+        bend = randomisation.candidate_joint * error[:, 6:]
+        self.buffers.write(
+            rows,
+            position=c.position[index] + randomisation.candidate_position * error[:, None, :3],
+            quaternion=quaternion_multiply(c.quaternion[index], tilt[:, None].expand(-1, NEAREST, 4)),
+            approach=c.approach[first],
+            pregrasp=c.pregrasp[first] + bend,
+            grasp=c.grasp[first] + bend,
+            reachable=reachable.float(),
+        )
 
     def goals(
         self, object_p: Float[Tensor, "n 3"], object_q: Float[Tensor, "n 4"]
@@ -114,14 +98,5 @@ class Choice:
         """World wrist positions and orientations that the candidates ask for at the objects' poses, and the
         direction of the first one's approach."""
         b = self.buffers
-        goals = in_world(b["position"], b["quaternion"], object_p, object_q)
-        return *goals, quaternion_apply(object_q, b["approach"])
-
-    def get_state(self) -> dict[str, Tensor]:
-        """Copies of all buffers by name."""
-        return {name: buffer.clone() for name, buffer in self.buffers.items()}
-
-    def set_state(self, state: dict[str, Tensor], rows: Tensor | slice) -> None:
-        """Inverse of `get_state` for the given rows."""
-        for name, buffer in self.buffers.items():
-            buffer[rows] = state[name].reshape(buffer[rows].shape)
+        goals = carried(b.position, b.quaternion, object_p, object_q)
+        return *goals, quaternion_apply(object_q, b.approach)

@@ -1,4 +1,4 @@
-"""The action as a bounded, low-passed correction of a reference, in the hand frame; the same for every reference.
+"""The residual action: a bounded, low-passed change of a reference in the hand frame, the same for every reference.
 
     x_target = x_reference * exp(bound * c),    c <- c + SMOOTHING (a - c)
 
@@ -21,73 +21,59 @@ from dora.geometry.rotations import (
     quaternion_multiply,
     rotation_vector_from_quaternion,
 )
+from dora.tasks.mdp.buffers import Buffers
+from dora.tasks.mdp.config import ResidualBounds
 
 SMOOTHING = 0.3
-"""Share of the new action in the low-passed correction."""
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Largest corrections: of the wrist along each axis [m], about each axis [rad], of a hand joint [rad]."""
-
-    position: float = 0.03
-    rotation: float = 0.2
-    joint: float = 0.3
+"""Share of the new action in the low-passed residual [1]."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """Where a reference sends the wrist (world pose, n rows) and the hand joints [rad]."""
+    """Where a reference sends the wrist (world pose [m], wxyz) and the hand joints [rad]."""
 
     wrist_p: Float[Tensor, "n 3"]
     wrist_q: Float[Tensor, "n 4"]
-    hand: Float[Tensor, "n 20"]
+    hand: Float[Tensor, "n hand"]
 
 
 class ResidualAction:
-    """Per-environment correction in units of the bounds.
+    """The low-passed residual of each environment, in units of the bounds.
 
     Attributes:
-        bounds: largest corrections at scale 1.
+        bounds: largest residuals at scale 1.
         scale: share of the bounds in force, for curricula.
-        value: low-passed correction (n, a) in [-1, 1]: 3 translation, 3 rotation vector, then the hand's part.
+        buffers: `residual` (n, a) in [-1, 1]: 3 translation, 3 rotation vector, then the hand's part.
     """
 
-    def __init__(self, num_envs: int, action_size: int, bounds: Bounds, device: torch.device):
+    def __init__(self, num_envs: int, action_size: int, bounds: ResidualBounds, device: torch.device):
         self.bounds, self.scale = bounds, 1.0
-        self.value = torch.zeros(num_envs, action_size, device=device)
+        self.buffers = Buffers(num_envs, device, residual=(action_size,))
 
     def set_scale(self, scale: float) -> None:
         """Puts a share of the bounds in force; raises InputError unless it is in [0, 1]."""
         if not 0 <= scale <= 1:
-            raise InputError(f"the share of the correction's bounds is {scale}; it has to be between 0 and 1")
+            raise InputError(f"the share of the residual's bounds is {scale}; it has to be between 0 and 1")
         self.scale = scale
 
     def begin(self, rows: Int[Tensor, " b"]) -> None:
-        """No correction in the environments that start anew."""
-        self.value[rows] = 0.0
+        """No residual in the environments that start anew."""
+        self.buffers.clear(rows)
 
     def apply(self, target: Target, action: Float[Tensor, "n a"], expand: Callable[[Tensor], Tensor]) -> Target:
-        """Takes in an action in [-1, 1] and corrects the target; call once per control step.
+        """Takes in an action in [-1, 1] and adds the residual to the target; call once per control step.
 
-        `expand` maps the action's hand part to (n, 20).
+        `expand` maps the action's hand part to all hand joints.
         """
-        self.value += SMOOTHING * (action - self.value)
-        c, bounds = self.scale * self.value, self.bounds
+        residual = self.buffers.residual
+        residual += SMOOTHING * (action - residual)
+        c, bounds = self.scale * residual, self.bounds
         turn = quaternion_from_rotation_vector(bounds.rotation * c[:, 3:6])
         return Target(
             target.wrist_p + quaternion_apply(target.wrist_q, bounds.position * c[:, :3]),
             quaternion_multiply(target.wrist_q, turn),
             target.hand + bounds.joint * expand(c[:, 6:]),
         )
-
-    def get_state(self) -> dict[str, Tensor]:
-        """What changes during an episode, for state dicts."""
-        return {"correction": self.value.clone()}
-
-    def set_state(self, state: dict[str, Tensor], rows: Tensor | slice) -> None:
-        """Inverse of `get_state` for the given rows."""
-        self.value[rows] = state["correction"].reshape(self.value[rows].shape)
 
 
 def wrist_step(

@@ -13,42 +13,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dora.geometry.poses import Pose
 from dora.geometry.rotations import (
     quaternion_apply,
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
-    quaternion_inverse,
     quaternion_multiply,
-    rotation_vector_from_quaternion,
 )
 
 GRAVITY = 9.81
-"""[m/s^2]"""
+"""Acceleration of a fall [m/s^2]."""
 LATEST = 1.0
 """Longest fall that is predicted [s]."""
 STEEP = 0.5
-"""Vertical part of a handle's axis below which it is not followed any more."""
+"""Vertical part of a handle's axis below which it is not followed any more [1]."""
 ROUNDS = 4
-"""Fixed-point iterations of the time of arrival; the spin between them is small."""
-
-Pose = tuple[Tensor, Tensor]
-
-
-def compose(a: Pose, b: Pose) -> Pose:
-    """Pose b, given in frame a, in the frame of a."""
-    return a[0] + quaternion_apply(a[1], b[0]), quaternion_multiply(a[1], b[1])
-
-
-def relative(a: Pose, b: Pose) -> Pose:
-    """Pose b in frame a, both given in one frame."""
-    back = quaternion_inverse(a[1])
-    return quaternion_apply(back, b[0] - a[0]), quaternion_multiply(back, b[1])
-
-
-def inverse(a: Pose) -> Pose:
-    """The frame in which a is given, in frame a."""
-    back = quaternion_inverse(a[1])
-    return -quaternion_apply(back, a[0]), back
+"""Fixed-point iterations of the time of arrival [1]; the spin between them is small."""
 
 
 def fall_time(height: Float[Tensor, " n"], speed: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
@@ -140,20 +120,3 @@ class Strike:
         quaternion = quaternion_multiply(turn, self._flat.expand(n, 4))
         face = pivot + quaternion_apply(turn, top - pivot)
         return face - quaternion_apply(quaternion, self.face), quaternion
-
-
-def slew(start: Pose, goal: Pose, step: float, turn: float) -> Pose:
-    """From `start` towards `goal` on the straight line, by at most `step` [m] and `turn` [rad]."""
-    shift = goal[0] - start[0]
-    spin = rotation_vector_from_quaternion(quaternion_multiply(goal[1], quaternion_inverse(start[1])))
-    steps = torch.maximum(shift.norm(dim=-1) / step, spin.norm(dim=-1) / turn).clamp(min=1)[:, None]
-    quaternion = quaternion_multiply(quaternion_from_rotation_vector(spin / steps), start[1])
-    return start[0] + shift / steps, quaternion / quaternion.norm(dim=-1, keepdim=True)
-
-
-def blend(old: Pose, new: Pose, share: Float[Tensor, " n"] | float) -> Pose:
-    """`old` moved towards `new` by a share of the difference, for nearby orientations (normalised mean)."""
-    share = torch.as_tensor(share).reshape(-1, 1)
-    same = torch.where((old[1] * new[1]).sum(-1, keepdim=True) < 0, -new[1], new[1])
-    quaternion = old[1] + share * (same - old[1])
-    return old[0] + share * (new[0] - old[0]), quaternion / quaternion.norm(dim=-1, keepdim=True)

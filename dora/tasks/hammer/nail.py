@@ -4,12 +4,14 @@ A nail's friction resists both ways. PhysX has no such joint friction here, and 
 a blow like a mass. What works is a viscous drive, a constant force upwards, and a lower limit that follows the nail
 down, so that it never comes back up: while the nail moves,
 
-    m a = F_hammer - RESISTANCE - DRAG * v,    v >= 0.
+    m a = F_hammer - resistance - drag * v,    v >= 0.
 
 The hammer's blow starts the nail at nearly the hammer's speed and is then spent against drag and resistance. Pushing
-moves it too, if slowly, and a nail pushed in has not been hammered: only what the nail sinks within `BLOW_WINDOW`
-after an impact above `BLOW_SPEED` counts as driven.
+moves it too, if slowly, and a nail pushed in has not been hammered: only what the nail sinks within `blow_window`
+after an impact above `blow_speed` counts as driven.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 import sapien
@@ -22,12 +24,6 @@ from torch import Tensor
 
 from dora.sim.substeps import watch_physics
 
-TRAVEL = 0.025
-"""How far the nail can sink [m]."""
-DRIVEN = 0.010
-"""How far blows must drive it [m]."""
-STAND = 0.08
-"""Height of the nail's head above the post before the first blow [m]."""
 HEAD_RADIUS = 0.008
 HEAD_HALF = 0.002
 """Radius and half thickness of the nail's head as it is drawn [m]."""
@@ -37,27 +33,42 @@ SHANK_RADIUS = 0.003
 """Radius of the nail, which is only drawn [m]."""
 POST_HALF = 0.025
 """Half width of the post [m]."""
-MASS = 0.05
-"""Mass of the nail [kg]."""
-RESISTANCE = 20.0
-"""Constant force against the hammer [N]."""
-DRAG = 40.0
-"""Force per speed against the hammer [N s/m]."""
+FRICTION = 0.5
+"""Friction of post and nail [1]."""
 DRIVE_LIMIT = 1e4
 """Largest force of the viscous drive [N]: none."""
-BLOW_SPEED = 0.5
-"""Speed of the striking face relative to the nail above which an impact is a blow [m/s]."""
-BLOW_WINDOW = 0.05
-"""Time after a blow in which the nail's motion counts as driven [s]."""
 MOVED = 1e-6
 """Sinking in one physics step that is motion and not rounding [m]."""
-NEAR = 0.3
+WATCHED = 0.3
 """Distance of the hammer's centre from the nail within which its speed is watched [m]."""
-FRICTION = 0.5
 DOWN = (0.7071068, 0.0, 0.7071068, 0.0)
-"""Turns +x, the axis of joints and cylinders, into -z: the joint's coordinate is the nail's depth."""
-PINE = (0.78, 0.60, 0.38, 1.0)
-IRON = (0.45, 0.46, 0.48, 1.0)
+"""Turns +x, the axis of joints and cylinders, into -z (wxyz): the joint's coordinate is the nail's depth."""
+PINE, IRON = (0.78, 0.60, 0.38, 1.0), (0.45, 0.46, 0.48, 1.0)
+"""Colours of the post and the nail: red, green, blue and opacity [1]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NailSettings:
+    """Numbers of a nail."""
+
+    top: tuple[float, float, float] = (0.65, -0.14, 0.30)
+    """Top of the undriven nail, world frame [m]."""
+    travel: float = 0.025
+    """How far the nail can sink [m]."""
+    driven: float = 0.010
+    """How far blows must drive it [m]."""
+    stand: float = 0.08
+    """Height of the nail's head above the post before the first blow [m]."""
+    mass: float = 0.05
+    """Mass of the nail [kg]."""
+    resistance: float = 20.0
+    """Constant force against the hammer [N]."""
+    drag: float = 40.0
+    """Force per speed against the hammer [N s/m]."""
+    blow_speed: float = 0.5
+    """Speed of the striking face relative to the nail above which an impact is a blow [m/s]."""
+    blow_window: float = 0.05
+    """Time after a blow in which the nail's motion counts as driven [s]."""
 
 
 class Nail:
@@ -65,20 +76,21 @@ class Nail:
 
     Args:
         scene: the scene of all environments, on a CPU.
-        top: centre of the upper face of the undriven nail's head [m], world frame.
+        settings: numbers of the nail.
         dt: duration of a physics step [s].
     """
 
-    def __init__(self, scene: ManiSkillScene, top: tuple[float, float, float], dt: float):
-        self._place, self._dt, self._device = np.array(top, np.float32), dt, scene.device
-        self.articulation = _build(scene, top)
+    def __init__(self, scene: ManiSkillScene, settings: NailSettings, dt: float):
+        self.settings, self._dt, self._device = settings, dt, scene.device
+        self._place = np.array(settings.top, np.float32)
+        self.articulation = _build(scene, settings)
         joint = self.articulation.active_joints[0]
-        joint.set_drive_properties(0.0, DRAG, force_limit=DRIVE_LIMIT)
+        joint.set_drive_properties(0.0, settings.drag, force_limit=DRIVE_LIMIT)
         self._joints, self._bodies = joint._objs, self.articulation._objs
         n = scene.num_envs
         self._depth = np.zeros(n, np.float32)
         self._driven = np.zeros(n, np.float32)
-        self._since = np.full(n, BLOW_WINDOW, np.float32)
+        self._since = np.full(n, settings.blow_window, np.float32)
         self._speed = np.zeros(n, np.float32)
         self._impact = np.zeros(n, np.float32)
         self._hammers: list[sapien.physx.PhysxRigidDynamicComponent] = []
@@ -102,14 +114,19 @@ class Nail:
         index = rows.cpu().numpy()
         for buffer in (self._depth, self._driven, self._speed, self._impact):
             buffer[index] = 0.0
-        self._since[index] = BLOW_WINDOW
+        self._since[index] = self.settings.blow_window
         self._hold(index.tolist())
 
     def _hold(self, rows: list[int]) -> None:
         """Lets nails rise no higher than they are, and presses them up."""
         for i in rows:
-            self._joints[i].set_limits(np.array([[min(self._depth[i], TRAVEL - MOVED), TRAVEL]], np.float32))
-            self._bodies[i].set_qf(np.array([-RESISTANCE], np.float32))
+            self._limit(i)
+            self._bodies[i].set_qf(np.array([-self.settings.resistance], np.float32))
+
+    def _limit(self, i: int) -> None:
+        """Lets the nail of environment i move from where it is to the end of its travel."""
+        travel = self.settings.travel
+        self._joints[i].set_limits(np.array([[min(self._depth[i], travel - MOVED), travel]], np.float32))
 
     def _watch(self, i: int) -> None:
         """After a physics step of environment i: the ratchet, and what the step's motion counts."""
@@ -117,13 +134,13 @@ class Nail:
         depth = float(body.qpos[0])
         self._since[i] += self._dt
         if depth > before + MOVED:
-            if self._speed[i] > BLOW_SPEED:
+            if self._speed[i] > self.settings.blow_speed:
                 self._since[i] = 0.0
                 self._impact[i] = self._speed[i]
-            if self._since[i] < BLOW_WINDOW:
+            if self._since[i] < self.settings.blow_window:
                 self._driven[i] += depth - before
             self._depth[i] = depth
-            self._joints[i].set_limits(np.array([[min(depth, TRAVEL - MOVED), TRAVEL]], np.float32))
+            self._limit(i)
         self._speed[i] = self._approach(i, float(body.qvel[0]))
 
     def _approach(self, i: int, nail_speed: float) -> float:
@@ -131,7 +148,7 @@ class Nail:
         hammer = self._hammers[i]
         pose = hammer.entity_pose
         away = pose.p - self._place
-        if away @ away > NEAR * NEAR:
+        if away @ away > WATCHED * WATCHED:
             return 0.0
         arm = pose.to_transformation_matrix()[:3, :3] @ self._faces[i]
         spin = hammer.angular_velocity
@@ -166,30 +183,30 @@ class Nail:
         self._hold(index.tolist())
 
 
-def _build(scene: ManiSkillScene, top: tuple[float, float, float]) -> Articulation:
+def _build(scene: ManiSkillScene, settings: NailSettings) -> Articulation:
     """Post and nail as an articulation; its root is where the top of the undriven nail is."""
     builder = scene.create_articulation_builder()
     material = PhysxMaterial(FRICTION, FRICTION, 0.0)
-    height = top[2] - STAND
+    height = settings.top[2] - settings.stand
     post = builder.create_link_builder()
     post.set_name("post")
-    centre, half = sapien.Pose([0, 0, -STAND - height / 2]), (POST_HALF, POST_HALF, height / 2)
+    centre, half = sapien.Pose([0, 0, -settings.stand - height / 2]), (POST_HALF, POST_HALF, height / 2)
     post.add_box_collision(centre, half, material)
     nail = builder.create_link_builder(post)
     nail.set_name("nail")
     axis = sapien.Pose(q=DOWN)
     nail.set_joint_name("nail")
-    nail.set_joint_properties("prismatic", [[0.0, TRAVEL]], axis, axis)
+    nail.set_joint_properties("prismatic", [[0.0, settings.travel]], axis, axis)
     head = sapien.Pose([0, 0, -HEAD_HALF], DOWN)
-    density = MASS / (np.pi * HEAD_RADIUS**2 * 2 * STOP_HALF)
+    density = settings.mass / (np.pi * HEAD_RADIUS**2 * 2 * STOP_HALF)
     stop = sapien.Pose([0, 0, -STOP_HALF], DOWN)
     nail.add_cylinder_collision(stop, HEAD_RADIUS, STOP_HALF, material, density=density)
     if scene.can_render():
         pine, iron = (sapien.render.RenderMaterial(base_color=list(c), roughness=0.6) for c in (PINE, IRON))
         post.add_box_visual(centre, half, pine)
         nail.add_cylinder_visual(head, HEAD_RADIUS, HEAD_HALF, iron)
-        nail.add_cylinder_visual(sapien.Pose([0, 0, -STAND / 2], DOWN), SHANK_RADIUS, STAND / 2, iron)
-    builder.initial_pose = sapien.Pose(list(top))
+        nail.add_cylinder_visual(sapien.Pose([0, 0, -settings.stand / 2], DOWN), SHANK_RADIUS, settings.stand / 2, iron)
+    builder.initial_pose = sapien.Pose(list(settings.top))
     articulation = builder.build("nail", fix_root_link=True)
     for link in articulation.links:
         link.disable_gravity = True

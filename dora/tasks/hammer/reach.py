@@ -8,9 +8,9 @@ from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand.protocol import flexion
+from dora.geometry.poses import carried
 from dora.geometry.rotations import quaternion_apply, rotation_angle
 from dora.robot import RobotDescription
-from dora.tasks.guidance.candidate_choice import in_world
 from dora.tasks.hammer.ballistics import slid
 
 REACH = (0.16, 0.16)
@@ -38,7 +38,7 @@ def within_reach(
         home_p: the wrist's start [m], world frame.
         home_q: its orientation.
     """
-    position, quaternion = in_world(candidates.position, candidates.quaternion, object_p, object_q)
+    position, quaternion = carried(candidates.position, candidates.quaternion, object_p, object_q)
     b, c = position.shape[:2]
     up = torch.tensor([0.0, 0.0, 1.0], device=object_p.device).expand_as(object_p)
     axis = quaternion_apply(object_q, up).repeat_interleave(c, 0)

@@ -7,14 +7,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.geometry.rotations import quaternion_apply, quaternion_inverse
-from dora.tasks.mdp.snapshot import TIP_RADIUS, Snapshot, derived, in_wrist
+from dora.tasks.mdp.quantities import in_wrist
+from dora.tasks.mdp.snapshot import Snapshot, derived
 
-GRIP = (0.045, 0.0, 0.150)
-"""Middle of a closed grip in the hand frame [m]."""
+HAND_CENTRE = (0.045, 0.0, 0.150)
+"""Middle of what a closed hand holds, in the hand frame [m]."""
 HANDLE_RADIUS = 0.0105
 """Radius of the handle, the smaller half axis of its oval [m]."""
-IN_HAND = 0.07
-"""Distance of the handle's axis from the middle of the grip up to which the hammer is in the hand [m]."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +24,8 @@ class HammerSnapshot(Snapshot):
         nail_p: centre of the nail's head now [m].
         nail_depth: how far the nail has sunk [m].
         nail_driven: how far it has been driven by blows [m].
-        drift_p, drift_r: how far the hammer has moved in the hand within the last WINDOW control steps [m], [rad];
-            large before the window is full.
+        drift_p, drift_r: how far the hammer has moved in the hand within the last moments [m], [rad]; large before they
+            are over.
         face: centre of the striking face, hammer frame [m].
         butt, neck: ends of the handle's axis, hammer frame [m].
     """
@@ -42,7 +41,7 @@ class HammerSnapshot(Snapshot):
 
 
 def _axis(s: Snapshot, x: float, y: float, z: float) -> Tensor:
-    return quaternion_apply(s.object_q, torch.tensor([x, y, z], device=s.object_q.device).expand(len(s.object_q), 3))
+    return quaternion_apply(s.object.q, torch.tensor([x, y, z], device=s.object.q.device).expand(len(s.object.q), 3))
 
 
 @derived
@@ -66,42 +65,42 @@ def misalignment(s: Snapshot) -> Float[Tensor, " n"]:
 @derived
 def face_to_nail(s: HammerSnapshot) -> Float[Tensor, "n 3"]:
     """From the centre of the striking face to the nail's head [m], world frame."""
-    return s.nail_p - s.object_p - quaternion_apply(s.object_q, s.face)
+    return s.nail_p - s.object.p - quaternion_apply(s.object.q, s.face)
 
 
 def handle_distance(s: HammerSnapshot, point: Float[Tensor, "n k 3"]) -> Float[Tensor, "n k"]:
     """Distance of points (world frame) from the handle's axis, a line between its two ends [m]."""
-    q = quaternion_inverse(s.object_q)[:, None].expand(-1, point.shape[1], -1)
-    local = quaternion_apply(q, point - s.object_p[:, None]) - s.butt[:, None]
+    q = quaternion_inverse(s.object.q)[:, None].expand(-1, point.shape[1], -1)
+    local = quaternion_apply(q, point - s.object.p[:, None]) - s.butt[:, None]
     along = (s.neck - s.butt)[:, None]
     share = ((local * along).sum(-1, keepdim=True) / along.square().sum(-1, keepdim=True)).clamp(0, 1)
     return (local - share * along).norm(dim=-1)
 
 
 @derived
-def tip_distance(s: HammerSnapshot) -> Float[Tensor, "n 5"]:
+def tip_distance(s: HammerSnapshot) -> Float[Tensor, "n fingers"]:
     """Distance of each fingertip's surface from the handle's [m]."""
-    return handle_distance(s, s.tip_p) - TIP_RADIUS - HANDLE_RADIUS
+    return handle_distance(s, s.hand.tip_p) - s.hand.tip_radius - HANDLE_RADIUS
 
 
 @derived
-def grip_distance(s: HammerSnapshot) -> Float[Tensor, " n"]:
-    """Distance of the middle of the grip from the handle's axis [m]."""
-    grip = torch.tensor(GRIP, device=s.wrist_p.device).expand_as(s.wrist_p)
-    return handle_distance(s, (s.wrist_p + quaternion_apply(s.wrist_q, grip))[:, None])[:, 0]
+def off_centre(s: HammerSnapshot) -> Float[Tensor, " n"]:
+    """Distance of the middle of the hand from the handle's axis [m]."""
+    centre = torch.tensor(HAND_CENTRE, device=s.hand.wrist_p.device).expand_as(s.hand.wrist_p)
+    return handle_distance(s, (s.hand.wrist_p + quaternion_apply(s.hand.wrist_q, centre))[:, None])[:, 0]
 
 
 @derived
 def relative_speed(s: Snapshot) -> Float[Tensor, " n"]:
     """Speed of the hammer's centre of mass as seen from the hand [m/s]."""
-    carried = s.wrist_v + torch.linalg.cross(s.wrist_w, s.object_p - s.wrist_p)
-    return (s.object_v - carried).norm(dim=-1)
+    carried = s.hand.wrist_v + torch.linalg.cross(s.hand.wrist_w, s.object.p - s.hand.wrist_p)
+    return (s.object.v - carried).norm(dim=-1)
 
 
 @derived
 def fingers_on(s: Snapshot) -> Float[Tensor, " n"]:
     """Number of fingers, the thumb included, that touch the hammer."""
-    return s.touch[:, :5].float().sum(-1)
+    return s.hand.touch[:, :-1].float().sum(-1)
 
 
 @derived

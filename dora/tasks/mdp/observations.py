@@ -1,7 +1,7 @@
 """The observation as a table: name, function of the snapshot, size, unit and meaning of every entry."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -14,7 +14,8 @@ from dora.geometry.rotations import (
     quaternion_multiply,
 )
 from dora.tasks.mdp.guidance_parts import OBSERVATION, PRIOR
-from dora.tasks.mdp.snapshot import Snapshot, goal_error, in_wrist, lifted, near_errors, turned_in_wrist
+from dora.tasks.mdp.quantities import goal_error, in_wrist, lifted, near_errors, turned_in_wrist
+from dora.tasks.mdp.snapshot import Snapshot
 
 FASTEST_SPIN = 30.0
 """Spin of an object that is still told apart, about each axis [rad/s]; a slender one that is hit spins faster."""
@@ -44,8 +45,32 @@ class Entry:
         return not self.guided or (PRIOR if self.prior else OBSERVATION) in parts
 
 
+def observation_table(arms: Sequence[str], extra: Mapping[str, Entry], parts: frozenset[str]) -> dict[str, Entry]:
+    """The entries of a task's observation, in order.
+
+    Args:
+        arms: names of the arms. With several, each arm has all entries, under `<arm>/<name>`, of what it sees.
+        extra: the task's own entries beyond `ARM_ENTRIES` and `SHARED_ENTRIES`, of one arm.
+        parts: parts of guidance in force; entries of other parts are left out.
+    """
+    table = {**ARM_ENTRIES, **extra}
+    if len(arms) > 1:
+        own = {name: entry for name, entry in table.items() if name not in SHARED_ENTRIES}
+        seen = {
+            f"{arm}/{name}": replace(entry, value=_as_seen_by(arm, entry))
+            for arm in arms
+            for name, entry in own.items()
+        }
+        table = {**seen, **{name: ARM_ENTRIES[name] for name in SHARED_ENTRIES}}
+    return {name: entry for name, entry in table.items() if entry.exists(parts)}
+
+
+def _as_seen_by(arm: str, entry: Entry) -> Callable[[Any], Tensor]:
+    return lambda s: entry.value(s.of(arm))
+
+
 def _object_spin(s: Snapshot) -> Tensor:
-    return turned_in_wrist(s, s.object_w).clamp(-FASTEST_SPIN, FASTEST_SPIN)
+    return turned_in_wrist(s, s.object.w).clamp(-FASTEST_SPIN, FASTEST_SPIN)
 
 
 def _axes(q: Tensor) -> Tensor:
@@ -54,55 +79,54 @@ def _axes(q: Tensor) -> Tensor:
 
 
 def _tips(s: Snapshot) -> Tensor:
-    n = len(s.tip_p)
-    wrist = [s.wrist_p, s.wrist_q]
-    p, q = (x[:, None].expand(n, 5, x.shape[-1]).reshape(n * 5, -1) for x in wrist)
-    return quaternion_apply(quaternion_inverse(q), s.tip_p.reshape(n * 5, 3) - p).reshape(n, 15)
+    n, fingers = s.hand.tip_p.shape[:2]
+    p, q = (x[:, None].expand(n, fingers, x.shape[-1]).flatten(0, 1) for x in (s.hand.wrist_p, s.hand.wrist_q))
+    return quaternion_apply(quaternion_inverse(q), s.hand.tip_p.flatten(0, 1) - p).reshape(n, 3 * fingers)
 
 
 def _tip_directions(s: Snapshot) -> Tensor:
-    return matrix_from_quaternion(s.tip_q)[..., 2].flatten(-2)
+    return matrix_from_quaternion(s.hand.tip_q)[..., 2].flatten(-2)
 
 
 def _object_turn(s: Snapshot) -> Tensor:
-    return _axes(quaternion_multiply(quaternion_inverse(s.wrist_q), s.object_q))
+    return _axes(quaternion_multiply(quaternion_inverse(s.hand.wrist_q), s.object.q))
 
 
-OBSERVATIONS: dict[str, Entry] = {
-    "hand_q": Entry(lambda s: s.hand_q, "rad", "hand joint angles, thumb to pinky"),
-    "hand_v": Entry(lambda s: s.hand_v, "rad/s", "hand joint velocities"),
-    "hand_lead": Entry(lambda s: s.hand_target - s.hand_q, "rad", "commanded minus measured hand joints"),
-    "arm_q": Entry(lambda s: s.arm_q, "rad", "arm joint angles"),
+ARM_ENTRIES: dict[str, Entry] = {
+    "hand_q": Entry(lambda s: s.hand.q, "rad", "hand joint angles, thumb to pinky"),
+    "hand_v": Entry(lambda s: s.hand.v, "rad/s", "hand joint velocities"),
+    "hand_lead": Entry(lambda s: s.hand.target - s.hand.q, "rad", "commanded minus measured hand joints"),
+    "arm_q": Entry(lambda s: s.hand.arm_q, "rad", "arm joint angles"),
     "tips": Entry(_tips, "m", "fingertip positions in the hand frame"),
     "tip_axes": Entry(_tip_directions, "1", "fingertip directions (tip z axes), world frame"),
-    "wrist_p": Entry(lambda s: s.wrist_p, "m", "wrist position, world frame"),
-    "wrist_R": Entry(lambda s: _axes(s.wrist_q), "1", "wrist orientation, two columns of its matrix"),
-    "wrist_v": Entry(lambda s: s.wrist_v, "m/s", "wrist linear velocity, world frame"),
-    "wrist_w": Entry(lambda s: s.wrist_w, "rad/s", "wrist angular velocity, world frame"),
-    "object_p": Entry(lambda s: in_wrist(s, s.object_p), "m", "object position in the hand frame"),
+    "wrist_p": Entry(lambda s: s.hand.wrist_p, "m", "wrist position, world frame"),
+    "wrist_R": Entry(lambda s: _axes(s.hand.wrist_q), "1", "wrist orientation, two columns of its matrix"),
+    "wrist_v": Entry(lambda s: s.hand.wrist_v, "m/s", "wrist linear velocity, world frame"),
+    "wrist_w": Entry(lambda s: s.hand.wrist_w, "rad/s", "wrist angular velocity, world frame"),
+    "object_p": Entry(lambda s: in_wrist(s, s.object.p), "m", "object position in the hand frame"),
     "object_R": Entry(_object_turn, "1", "object orientation in the hand frame, two columns of its matrix"),
-    "object_v": Entry(lambda s: turned_in_wrist(s, s.object_v), "m/s", "object velocity in the hand's axes"),
+    "object_v": Entry(lambda s: turned_in_wrist(s, s.object.v), "m/s", "object velocity in the hand's axes"),
     "object_w": Entry(_object_spin, "rad/s", f"object spin in the hand's axes, clipped at {FASTEST_SPIN:g}"),
     "object_rise": Entry(lambda s: lifted(s)[:, None], "m", "height of the object above its start"),
-    "touch": Entry(lambda s: s.touch.float(), "1", "contact of thumb, index, middle, ring, pinky, palm"),
+    "touch": Entry(lambda s: s.hand.touch.float(), "1", "contact of thumb, index, middle, ring, pinky, palm"),
     "max_penetration": Entry(
-        lambda s: s.max_penetration[:, None] * 1000, "mm", "deepest penetration of the episode so far"
+        lambda s: s.max_penetration[:, None] * 1000, "mm", "largest overlap of the episode so far"
     ),
     "stage": Entry(lambda s: s.stage[:, None].float(), "1", "index of the active stage"),
     "time": Entry(lambda s: s.time[:, None], "1", "share of the episode that is over"),
     "goal": Entry(
-        lambda s: torch.cat(goal_error(s), -1),
-        "m, rad",
-        "wrist to candidate: position and rotation vector",
-        True,
+        lambda s: torch.cat(goal_error(s), -1), "m, rad", "wrist to candidate: position and rotation vector", True
     ),
-    "goal_hand": Entry(lambda s: s.goal_grasp - s.hand_q, "rad", "candidate's closed hand minus measured joints", True),
+    "goal_hand": Entry(lambda s: s.goal.grasp - s.hand.q, "rad", "candidate's closed hand minus measured joints", True),
     "near": Entry(
         lambda s: near_errors(s)[:, 1:].flatten(1),
         "m, rad",
         "wrist to the next nearest candidates: position and rotation vector of each",
         True,
     ),
-    "phase": Entry(lambda s: s.phase, "1", "phase of the reference", True, True),
-    "correction": Entry(lambda s: s.correction, "1", "low-passed correction, in units of the bounds", True, True),
+    "phase": Entry(lambda s: s.goal.phase, "1", "phase of the reference", True, True),
+    "residual": Entry(lambda s: s.goal.residual, "1", "low-passed residual action, in units of its bounds", True, True),
 }
+"""What every arm of every task observes."""
+SHARED_ENTRIES = ("max_penetration", "stage", "time")
+"""Those of them that are the same for all arms of a task."""

@@ -17,6 +17,7 @@ S = TypeVar("S")
 """A task's snapshot type: a frozen dataclass of tensors whose first axis is the environment."""
 
 Part = Literal["affordance", "task", "penalty"]
+"""Parts of the schema; the weight of a penalty is negative."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +66,22 @@ class Terms(Generic[S]):
         return torch.stack(list(parts.values())).sum(0), parts
 
 
-def closeness(distance: Tensor, tolerance: float, reach: float) -> Tensor:
-    """Shaping primitive: 1 within `tolerance`, falling smoothly to 0.1 at `tolerance + reach`.
+def tolerance(
+    x: Tensor, bounds: tuple[float, float] = (0.0, 0.0), margin: float = 0.0, value_at_margin: float = 0.1
+) -> Tensor:
+    """Shaping primitive with the name and arguments of dm_control's, whose sigmoid is "tanh_squared".
 
-    Both anchors are in the unit of `distance`. Raises ValueError for a negative tolerance or a reach <= 0.
+    1 within `bounds`, falling smoothly to `value_at_margin` at `margin` outside of them; with `margin` 0 it is 0 there.
+    Bounds and margin are in the unit of `x`.
+
+    Raises:
+        ValueError: for a lower bound above the upper one, a negative margin or a value at the margin outside (0, 1).
     """
-    if tolerance < 0 or reach <= 0:
-        raise ValueError(f"need tolerance >= 0 and reach > 0, got {tolerance} and {reach}")
-    scale = atanh(sqrt(0.9)) / reach
-    return 1 - torch.tanh(scale * (distance - tolerance).clamp(min=0)) ** 2
+    lower, upper = bounds
+    if lower > upper or margin < 0 or not 0 < value_at_margin < 1:
+        raise ValueError(f"need lower <= upper, margin >= 0 and 0 < value_at_margin < 1, got {bounds}, {margin}")
+    outside = torch.maximum(lower - x, x - upper).clamp(min=0)
+    if margin == 0:
+        return (outside == 0).to(x.dtype)
+    scale = atanh(sqrt(1 - value_at_margin)) / margin
+    return 1 - torch.tanh(scale * outside) ** 2

@@ -1,113 +1,181 @@
-"""What a one-arm task reads from the simulator: one frozen record per control step, world frame, SI units."""
+"""What a task reads from the simulator: one frozen record per control step, world frame, SI units.
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+A scene has hands (each with its arm), objects, and for each arm a goal: what the chosen grasp candidate asks for.
+With one arm, `s.hand`, `s.object` and `s.goal` are the only ones. With several, `s.of("left")` is the same snapshot as
+one arm sees it: its hand, the object it handles, its goal. So functions of a snapshot serve both.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from functools import wraps
 from typing import Any, TypeVar
 
-import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dora.geometry.rotations import (
-    quaternion_apply,
-    quaternion_inverse,
-    quaternion_multiply,
-    rotation_vector_from_quaternion,
-)
-
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
-"""Finger order of every tensor with a finger axis."""
-TIP_RADIUS = 0.011
-"""Radius of a fingertip [m]."""
-
-
+"""Finger order of every tensor with a finger axis; a robot's fingers are in this order."""
 CONTACT_CLASSES = ("none", "palm", *FINGERS)
-"""Names of the values of `Snapshot.contact_finger`."""
-
-
+"""Names of the values of `HandState.contact_finger`."""
 DERIVED, FROM_CONTACTS = "_derived", "_from_contacts"
 """Where a snapshot keeps what `derived` and `derived_from_contacts` functions have computed."""
 
 
 @dataclass(frozen=True)
-class Snapshot:
-    """State of n environments after a control step. Poses are (position [m], quaternion wxyz).
+class HandState:
+    """One hand, its arm, and its contacts with the object that it handles.
+
+    Poses are (position [m], quaternion wxyz) in the world.
 
     Attributes:
         arm_q: arm joints [rad].
-        hand_q, hand_v: measured hand joints [rad], [rad/s].
-        hand_target: commanded hand joints [rad].
+        q, v: measured hand joints [rad], [rad/s].
+        target: commanded hand joints [rad].
         wrist_p, wrist_q, wrist_v, wrist_w: pose, linear [m/s] and angular velocity [rad/s] of the hand's base.
         tip_p, tip_q: fingertip poses.
-        object_p, object_q, object_v, object_w: pose and velocities of the manipulated object.
-        object_half: half extents of the object's box, or of its bounding box [m].
-        start_p: object position at the start of the episode [m].
+        tip_radius: radius of the fingertips [m].
         touch: contact of each finger, then the palm, with the object during the last physics step.
         force: magnitude of those contacts' forces [N].
-        supported: the object touches the world (table, stand).
-        penetration: deepest overlap of hand and object, or of either with the world, now [m].
-        max_penetration: the same, maximum over the episode [m].
-        stage: index of the active stage; the number of stages when all are done.
-        time: share of the episode that is over, 0 to 1.
-        action, previous_action: last two actions, as given.
-        goal_p, goal_q: wrist pose that the chosen candidate asks for now (it follows the object).
-        goal_approach: unit direction of the wrist's last motion towards it, world frame.
-        goal_pregrasp, goal_grasp: hand joints of that candidate [rad].
-        near_p, near_q: the same poses for the nearest reachable candidates, the chosen one first.
-        phase: the reference's phase, one-hot.
-        correction: low-passed correction of the reference, in units of the bounds.
         contact_p: contact points of the hand on the object in the last physics step, object frame [m].
         contact_finger: what touches there: 0 nothing (an empty row), 1 palm, 2 thumb, ... 6 pinky.
     """
 
-    arm_q: Float[Tensor, "n 7"]
-    hand_q: Float[Tensor, "n 20"]
-    hand_v: Float[Tensor, "n 20"]
-    hand_target: Float[Tensor, "n 20"]
+    arm_q: Float[Tensor, "n arm"]
+    q: Float[Tensor, "n hand"]
+    v: Float[Tensor, "n hand"]
+    target: Float[Tensor, "n hand"]
     wrist_p: Float[Tensor, "n 3"]
     wrist_q: Float[Tensor, "n 4"]
     wrist_v: Float[Tensor, "n 3"]
     wrist_w: Float[Tensor, "n 3"]
-    tip_p: Float[Tensor, "n 5 3"]
-    tip_q: Float[Tensor, "n 5 4"]
-    object_p: Float[Tensor, "n 3"]
-    object_q: Float[Tensor, "n 4"]
-    object_v: Float[Tensor, "n 3"]
-    object_w: Float[Tensor, "n 3"]
-    object_half: Float[Tensor, "n 3"]
+    tip_p: Float[Tensor, "n fingers 3"]
+    tip_q: Float[Tensor, "n fingers 4"]
+    tip_radius: float
+    touch: Bool[Tensor, "n parts"]
+    force: Float[Tensor, "n parts"]
+    contact_p: Float[Tensor, "n points 3"]
+    contact_finger: Int[Tensor, "n points"]
+
+
+@dataclass(frozen=True)
+class ObjectState:
+    """One object.
+
+    Attributes:
+        p, q, v, w: pose in the world, linear [m/s] and angular velocity [rad/s].
+        half: half extents of the object's box, or of its bounding box [m].
+        start_p: position at the start of the episode [m].
+        supported: the object touches the world (table, stand).
+    """
+
+    p: Float[Tensor, "n 3"]
+    q: Float[Tensor, "n 4"]
+    v: Float[Tensor, "n 3"]
+    w: Float[Tensor, "n 3"]
+    half: Float[Tensor, "n 3"]
     start_p: Float[Tensor, "n 3"]
-    touch: Bool[Tensor, "n 6"]
-    force: Float[Tensor, "n 6"]
     supported: Bool[Tensor, " n"]
+
+
+@dataclass(frozen=True)
+class GoalState:
+    """What the grasp candidates of one arm ask for now (they follow the object), and what the arm's reference does.
+
+    Attributes:
+        p, q: wrist pose that the chosen candidate asks for, world frame.
+        approach: unit direction of the wrist's last motion towards it, world frame.
+        pregrasp, grasp: hand joints of that candidate [rad].
+        near_p, near_q: the same wrist poses for the nearest reachable candidates, the chosen one first.
+        phase: the reference's phase, one-hot.
+        residual: low-passed residual action, in units of its bounds.
+    """
+
+    p: Float[Tensor, "n 3"]
+    q: Float[Tensor, "n 4"]
+    approach: Float[Tensor, "n 3"]
+    pregrasp: Float[Tensor, "n hand"]
+    grasp: Float[Tensor, "n hand"]
+    near_p: Float[Tensor, "n k 3"]
+    near_q: Float[Tensor, "n k 4"]
+    phase: Float[Tensor, "n phases"]
+    residual: Float[Tensor, "n a"]
+
+
+Record = TypeVar("Record")
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """State of n environments after a control step.
+
+    Attributes:
+        hands, goals: by the name of the arm.
+        objects: by their names.
+        handles: name of the object that each arm handles.
+        penetration: largest overlap of hand and object, or of either with the world, now [m].
+        max_penetration: the same, maximum over the episode [m].
+        stage: index of the active stage; the number of stages when all are done.
+        time: share of the episode that is over, 0 to 1.
+        action, previous_action: last two actions, as given.
+    """
+
+    hands: Mapping[str, HandState]
+    objects: Mapping[str, ObjectState]
+    goals: Mapping[str, GoalState]
+    handles: Mapping[str, str]
     penetration: Float[Tensor, " n"]
     max_penetration: Float[Tensor, " n"]
     stage: Int[Tensor, " n"]
     time: Float[Tensor, " n"]
     action: Float[Tensor, "n a"]
     previous_action: Float[Tensor, "n a"]
-    goal_p: Float[Tensor, "n 3"]
-    goal_q: Float[Tensor, "n 4"]
-    goal_approach: Float[Tensor, "n 3"]
-    goal_pregrasp: Float[Tensor, "n 20"]
-    goal_grasp: Float[Tensor, "n 20"]
-    near_p: Float[Tensor, "n k 3"]
-    near_q: Float[Tensor, "n k 4"]
-    phase: Float[Tensor, "n p"]
-    correction: Float[Tensor, "n a"]
-    contact_p: Float[Tensor, "n m 3"]
-    contact_finger: Int[Tensor, "n m"]
+
+    @property
+    def hand(self) -> HandState:
+        """The only hand; ValueError if there are several."""
+        return _only(self.hands, "hands")
+
+    @property
+    def object(self) -> ObjectState:
+        """The only object; ValueError if there are several."""
+        return _only(self.objects, "objects")
+
+    @property
+    def goal(self) -> GoalState:
+        """The goal of the only arm; ValueError if there are several."""
+        return _only(self.goals, "goals")
+
+    def of(self: "S", arm: str) -> "S":
+        """The same state as one arm sees it: its hand, the object that it handles, its goal; made once."""
+        views = self.__dict__.setdefault("_views", {})
+        if arm not in views:
+            name = self.handles[arm]
+            views[arm] = replace(
+                self,
+                hands={arm: self.hands[arm]},
+                objects={name: self.objects[name]},
+                goals={arm: self.goals[arm]},
+                handles={arm: name},
+            )
+        return views[arm]
+
+
+def _only(records: Mapping[str, Record], what: str) -> Record:
+    if len(records) != 1:
+        raise ValueError(f"there are the {what} {', '.join(records)}: name one, or look through `snapshot.of(arm)`")
+    return next(iter(records.values()))
 
 
 S = TypeVar("S", bound=Snapshot)
 """A snapshot, perhaps one that a task has extended."""
-Derived = Callable[[Any], Any]
+Derived = Callable[..., Any]
 
 
 def derived(function: Derived) -> Derived:
     """Computes a quantity of a snapshot once, however many terms, stages and observations ask for it.
 
-    The quantity must not depend on `stage`, `phase` or `time`, which alone change when the machines advance.
+    Further arguments must be hashable (a task's configuration); the quantity is kept for each set of them. It must not
+    depend on `stage`, `phase` or `time`, which alone change when the machines advance.
     """
     return _once(function, DERIVED)
 
@@ -119,72 +187,36 @@ def derived_from_contacts(function: Derived) -> Derived:
 
 def _once(function: Derived, place: str) -> Derived:
     @wraps(function)
-    def once(s: Snapshot) -> Any:
+    def once(s: Snapshot, *settings: Any) -> Any:
         known = s.__dict__.setdefault(place, {})
-        if function not in known:
-            known[function] = function(s)
-        return known[function]
+        key = (function, *settings)
+        if key not in known:
+            known[key] = function(s, *settings)
+        return known[key]
 
     return once
 
 
-def advanced(s: S, **changes: Tensor) -> S:
-    """The snapshot with another `stage`, `phase` or `time`; what was derived from it stays."""
-    if not set(changes) <= {"stage", "phase", "time"}:
-        raise ValueError(f"only stage, phase and time may change, not {sorted(changes)}")
-    return _sharing(s, replace(s, **changes), DERIVED, FROM_CONTACTS)
+def extended(s: Snapshot, kind: type[S], **more: Any) -> S:
+    """The snapshot as one of a subclass, with the fields that it adds."""
+    own: dict[str, Any] = {f.name: getattr(s, f.name) for f in fields(s)}
+    return kind(**own, **more)
 
 
-def observed(s: S, **changes: Tensor) -> S:
+def advanced(s: S, stage: Tensor, phases: Mapping[str, Tensor]) -> S:
+    """The snapshot with another stage and other phases of the references (by arm); what was derived stays."""
+    goals = {arm: replace(goal, phase=phases[arm]) for arm, goal in s.goals.items()}
+    return _sharing(s, replace(s, stage=stage, goals=goals), DERIVED, FROM_CONTACTS)
+
+
+def observed(
+    s: S, hands: Mapping[str, HandState], objects: Mapping[str, ObjectState], goals: Mapping[str, GoalState]
+) -> S:
     """The snapshot with noise in poses and joints; what was derived from contacts alone stays."""
-    return _sharing(s, replace(s, **changes), FROM_CONTACTS)
+    return _sharing(s, replace(s, hands=hands, objects=objects, goals=goals), FROM_CONTACTS)
 
 
 def _sharing(old: S, new: S, *places: str) -> S:
     for place in places:
         new.__dict__[place] = old.__dict__.setdefault(place, {})
     return new
-
-
-def in_wrist(s: Snapshot, point: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """World point -> hand-base frame [m]."""
-    return quaternion_apply(quaternion_inverse(s.wrist_q), point - s.wrist_p)
-
-
-def turned_in_wrist(s: Snapshot, vector: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """World direction -> hand-base frame (unit unchanged)."""
-    return quaternion_apply(quaternion_inverse(s.wrist_q), vector)
-
-
-@derived
-def tips_in_object(s: Snapshot) -> Float[Tensor, "n 5 3"]:
-    """Fingertips in the object frame [m]."""
-    q = quaternion_inverse(s.object_q)[:, None].expand(-1, 5, -1)
-    return quaternion_apply(q, s.tip_p - s.object_p[:, None])
-
-
-@derived
-def goal_error(s: Snapshot) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Position [m] and rotation vector [rad] from the wrist to the candidate's goal, in the hand-base frame."""
-    turn = quaternion_multiply(quaternion_inverse(s.wrist_q), s.goal_q)
-    return in_wrist(s, s.goal_p), rotation_vector_from_quaternion(turn)
-
-
-@derived
-def near_errors(s: Snapshot) -> Float[Tensor, "n k 6"]:
-    """Position [m] and rotation vector [rad] from the wrist to each of the near candidates, in the hand-base frame."""
-    back = quaternion_inverse(s.wrist_q)[:, None].expand_as(s.near_q)
-    shift = quaternion_apply(back, s.near_p - s.wrist_p[:, None])
-    return torch.cat([shift, rotation_vector_from_quaternion(quaternion_multiply(back, s.near_q))], -1)
-
-
-@derived
-def lifted(s: Snapshot) -> Float[Tensor, " n"]:
-    """Height of the object above its start [m]."""
-    return s.object_p[:, 2] - s.start_p[:, 2]
-
-
-@derived
-def opposed(s: Snapshot) -> Bool[Tensor, " n"]:
-    """The thumb and at least one more finger touch the object."""
-    return s.touch[:, 0] & s.touch[:, 1:5].any(-1)

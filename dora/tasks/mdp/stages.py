@@ -18,7 +18,7 @@ class Stage(Generic[S]):
         name: unique, snake_case; appears in logs as `stage/<name>`.
         progress: snapshot -> (N,) in [0, 1], how near the stage is to done.
         done: snapshot -> (N,) bool, the stage's own success test.
-        hold: consecutive control steps `done` must stay true before the next stage starts.
+        hold: time for which `done` must stay true before the next stage starts [s]; at least one control step.
         lost: snapshot -> (N,) bool, sends the environment back to `back_to`; None if nothing can be lost.
         back_to: name of an earlier stage.
     """
@@ -26,7 +26,7 @@ class Stage(Generic[S]):
     name: str
     progress: Callable[[S], Tensor]
     done: Callable[[S], Tensor]
-    hold: int = 1
+    hold: float = 0.0
     lost: Callable[[S], Tensor] | None = None
     back_to: str | None = None
 
@@ -34,8 +34,9 @@ class Stage(Generic[S]):
 class StageMachine(Generic[S]):
     """Holds, per environment, the active stage (K when all K are done), the hold count and the furthest stage."""
 
-    def __init__(self, stages: Sequence[Stage[S]], num_envs: int, device: torch.device | str = "cpu"):
-        """Builds the machine; raises ValueError for repeated names or a `back_to` that is no earlier stage."""
+    def __init__(self, stages: Sequence[Stage[S]], num_envs: int, dt: float, device: torch.device | str = "cpu"):
+        """Builds the machine, which advances every `dt` [s]; raises ValueError for repeated names or a `back_to` that
+        is no earlier stage."""
         names = [s.name for s in stages]
         if len(set(names)) != len(names):
             raise ValueError(f"stage names repeat: {names}")
@@ -49,7 +50,7 @@ class StageMachine(Generic[S]):
         self.held = torch.zeros_like(self.index)
         self.furthest = torch.zeros_like(self.index)
         # Row K stands for "finished": never left, never held.
-        self._hold = torch.tensor([s.hold for s in stages] + [1], device=device)
+        self._hold = torch.tensor([max(1, round(s.hold / dt)) for s in stages] + [1], device=device)
         self._back = torch.tensor([names.index(s.back_to) if s.back_to else 0 for s in stages] + [0], device=device)
 
     def __len__(self) -> int:

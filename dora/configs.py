@@ -1,0 +1,90 @@
+"""Configurations as frozen dataclasses: overriding fields by name, and reading them back from plain data, checked."""
+
+import dataclasses
+import difflib
+from collections.abc import Mapping
+from typing import Any, TypeVar, get_type_hints
+
+import dacite
+
+from dora.errors import InputError
+
+C = TypeVar("C")
+"""A frozen dataclass whose fields are numbers, texts, tuples or such dataclasses."""
+
+
+def _number(value: Any) -> Any:
+    """Whole numbers are floats as well; a bool is neither."""
+    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+RULES = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _number})
+"""How plain data become dataclasses: unknown names and wrong types are refused, lists become tuples."""
+
+
+def plain(config: Any) -> dict[str, Any]:
+    """A configuration as nested dicts of plain data, for YAML and JSON; tuples become lists."""
+    return {f.name: _plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return plain(value)
+    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
+
+
+def overridden(config: C, changes: Any, what: str) -> C:
+    """A configuration with some fields replaced.
+
+    Args:
+        config: has the other values.
+        changes: new values by name, nested for nested configurations; or a whole configuration of the same class.
+        what: how messages call it, such as "config".
+
+    Raises:
+        InputError: naming the first field that is unknown (with the nearest known name) or of the wrong type.
+    """
+    if isinstance(changes, type(config)):
+        return changes
+    if not isinstance(changes, Mapping):
+        raise InputError(f"{what} must be a mapping of names to values or a {type(config).__name__}, not {changes!r}.")
+    try:
+        return dacite.from_dict(type(config), _merged(plain(config), changes, what), RULES)
+    except dacite.DaciteError as error:
+        raise InputError(f"{what}: {_sentence(error)}.") from error
+
+
+def _merged(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> dict[str, Any]:
+    merged = dict(values)
+    for name, value in changes.items():
+        if name not in values:
+            near = difflib.get_close_matches(str(name), values, 1)
+            hint = f"did you mean {near[0]!r}?" if near else f"choose among {', '.join(values)}."
+            raise InputError(f"{where} has no field {str(name)!r}: {hint}")
+        nested = isinstance(values[name], dict) and isinstance(value, Mapping)
+        merged[name] = _merged(values[name], value, f"{where}.{name}") if nested else _plain(value)
+    return merged
+
+
+def _sentence(error: dacite.DaciteError) -> str:
+    """What is wrong with a field, without a full stop."""
+    if isinstance(error, dacite.WrongTypeError):
+        wanted = getattr(error.field_type, "__name__", str(error.field_type))
+        return f"{error.field_path} must be {wanted}, not {error.value!r}"
+    return str(error).rstrip(".")
+
+
+def built(cls: type[C], values: Mapping[str, Any]) -> C:
+    """A configuration of plain data, its types checked; fields of generic types are taken as they are.
+
+    Raises:
+        InputError: a name is missing or unknown, or a value has the wrong type.
+    """
+    known = {f.name: f for f in dataclasses.fields(cls)}  # pyright: ignore[reportArgumentType]
+    hints = {name: Any if isinstance(hint, TypeVar) else hint for name, hint in get_type_hints(cls).items()}
+    loose = dataclasses.make_dataclass(cls.__name__, [(n, hints[n], f) for n, f in known.items()], kw_only=True)
+    try:
+        checked = dacite.from_dict(loose, values, RULES)
+    except dacite.DaciteError as error:
+        raise InputError(f"settings: {_sentence(error)}.") from error
+    return cls(**{name: getattr(checked, name) for name in known})

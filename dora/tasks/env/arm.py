@@ -1,0 +1,182 @@
+"""One arm of a task: its robot, the object that it handles, its guide, and what its actions command."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.reach.approach_paths import ReachSettings
+from dora.affordance.reach.feasibility import Reach
+from dora.affordance.reach.feasibility_table import Grid, ReachTable
+from dora.geometry.poses import Pose, compose
+from dora.geometry.rotations import quaternion_apply, quaternion_inverse
+from dora.robot.motion.controller_rollout import Controller
+from dora.sim.robot_agent import DescribedRobot
+from dora.tasks.guidance.guide import Guide
+from dora.tasks.guidance.residual_action import Target, wrist_step
+from dora.tasks.mdp.guidance_parts import FILTER, PRIOR
+from dora.tasks.mdp.randomisation import Randomisation
+from dora.tasks.mdp.snapshot import Snapshot
+
+
+@dataclass(frozen=True)
+class ArmSpec:
+    """What a task says of one arm.
+
+    Attributes:
+        object: name of the object that it handles.
+        home: name of the robot's posture at the start of an episode.
+        position, quaternion: pose of the robot's base in the world [m], wxyz.
+    """
+
+    object: str
+    home: str = "home"
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+
+class Arm:
+    """One arm of a built scene; make a new one after a reconfiguration.
+
+    Args:
+        name, spec, agent, guide: see the attributes.
+        grid: where its object may stand, for the table of f_reach; None where it does not stand.
+        tables: tables of f_reach by the name of the arm, which outlive a reconfiguration.
+
+    Attributes:
+        name, spec: as the task says.
+        agent: the robot.
+        guide: candidates, reference and residual action.
+        home: world pose of the wrist at the start of an episode, (1, 3) [m] and (1, 4) wxyz.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        spec: ArmSpec,
+        agent: DescribedRobot,
+        guide: Guide,
+        grid: Grid | None,
+        tables: dict[str, ReachTable],
+    ):
+        self.name, self.spec, self.agent, self.guide, self._grid, self._tables = name, spec, agent, guide, grid, tables
+        device = agent.device
+        self.base: Pose = (
+            torch.tensor([spec.position], dtype=torch.float32, device=device),
+            torch.tensor([spec.quaternion], dtype=torch.float32, device=device),
+        )
+        self.home = compose(self.base, agent.posture_wrist(spec.home))
+
+    @property
+    def reach_table(self) -> ReachTable | None:
+        """f_reach of the candidates over the places where the object may stand; None where it does not stand."""
+        if self._grid is not None and self.name not in self._tables:
+            self._tables[self.name] = tabulated_reach(self, self._grid)
+        return self._tables.get(self.name)
+
+    @property
+    def action_size(self) -> int:
+        """Number of components of its part of the action."""
+        return math.prod(self.agent.single_action_space.shape or ())
+
+    @property
+    def corrects(self) -> bool:
+        """Whether actions are residuals of the reference: that part of guidance is in force, and actions command the
+        wrist."""
+        return PRIOR in self.guide.parts and self.agent.commands_wrist
+
+    def rest(self, rows: Int[Tensor, " b"]) -> None:
+        """Commands the home posture in the environments `rows`, where the robot has been put into it."""
+        if self.agent.commands_wrist:
+            posture = self.agent.description.postures[self.spec.home]
+            joints = torch.tensor([*posture.arm, *posture.hand], dtype=torch.float32, device=self.agent.device)
+            self.agent.wrist_controller.begin(rows, joints.expand(len(rows), -1))
+
+    def home_joints(self) -> Float[Tensor, " joints"]:
+        """The home posture in the simulator's order [rad]."""
+        posture = self.agent.description.postures[self.spec.home]
+        return torch.from_numpy(self.agent.qpos_of(posture.arm, posture.hand)).to(self.agent.device)
+
+    def choose(
+        self,
+        rows: Int[Tensor, " b"],
+        object_p: Float[Tensor, "b 3"],
+        object_q: Float[Tensor, "b 4"],
+        reachable: Bool[Tensor, "b c"],
+        error: Float[Tensor, "b e"],
+        randomisation: Randomisation,
+        narrow: Callable[[Tensor], Tensor] | None = None,
+    ) -> None:
+        """Gives new episodes their candidates and starts the reference.
+
+        Args:
+            rows: environments.
+            object_p, object_q: world poses of the handled object.
+            reachable: which candidates f_reach accepts; among those the nearest are chosen, if that part of guidance
+                is in force, or if there is no guidance at all and only the scripted solution uses candidates.
+            error: uniform numbers in [-1, 1] of the candidates' error.
+            randomisation: how large that error is.
+            narrow: takes the (b, c) candidates among which is chosen, and returns fewer.
+        """
+        wrist_p, wrist_q = (x.expand(len(rows), -1) for x in self.home)
+        choice, parts = self.guide.choice, self.guide.parts
+        wanted = reachable if FILTER in parts or not parts else torch.ones_like(reachable)
+        wanted = wanted if narrow is None else narrow(wanted)
+        index = choice.nearest(object_p, object_q, wrist_p, wrist_q, wanted)
+        choice.choose(rows, index, reachable.any(-1), error, randomisation)
+        self.guide.begin(rows, wrist_p, wrist_q)
+
+    def command(self, observed: Snapshot, action: Float[Tensor, "n a"]) -> Float[Tensor, "n a"]:
+        """What the controller is asked: the action itself, or the reference with the residual action.
+
+        Args:
+            observed: the state as this arm observes it.
+            action: its part of the action.
+        """
+        if not self.corrects:
+            return action
+        expand = self.agent.wrist_controller.expand_hand
+        return self._encoded(self.guide.target(observed, action, expand))
+
+    def scripted_action(self, observed: Snapshot) -> Float[Tensor, "n a"]:
+        """Action that executes the chosen candidate from the present state: zero where actions are residuals, and
+        elsewhere the reference's target as a plain action of the default controller."""
+        if self.corrects:
+            return torch.zeros(len(observed.time), self.action_size, device=observed.time.device)
+        target = self.guide.reference.target(observed)
+        self.guide.reference.aim(target)
+        return self._encoded(target)
+
+    def _encoded(self, target: Target) -> Float[Tensor, "n a"]:
+        """A world target of the wrist and a target of the hand as an action of the wrist controller, which counts in
+        the robot's base frame."""
+        controller: Any = self.agent.wrist_controller
+        commanded = controller.wrist()
+        n = len(commanded[0])
+        base = self.base[0].expand(n, -1), self.base[1].expand(n, -1)
+        step = wrist_step(target.wrist_p, target.wrist_q, *compose(base, commanded), controller.wrist_limits)
+        back = quaternion_inverse(base[1])
+        step = torch.cat([quaternion_apply(back, step[:, :3]), quaternion_apply(back, step[:, 3:])], -1)
+        return torch.cat([step, controller.hand_action(target.hand)], -1)
+
+
+def tabulated_reach(arm: Arm, grid: Grid) -> ReachTable:
+    """f_reach of an arm's candidates over a grid of places, made once and cached on disk.
+
+    The motions are those of the arm's controller and reference in its task.
+    """
+    obj, reference = load_object(arm.spec.object), arm.guide.reference
+    reach = Reach(
+        arm.agent.description,
+        obj,
+        base=(arm.spec.position, arm.spec.quaternion),
+        settings=ReachSettings(controller=Controller(period=reference.dt, descent=reference.descent)),
+        start=arm.spec.home,
+    )
+    candidates = arm.guide.choice.candidates.to("cpu")
+    return ReachTable.of(reach, candidates, grid, obj.support, obj.rest).to(arm.agent.device)

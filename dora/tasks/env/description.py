@@ -1,0 +1,87 @@
+"""The tables in force of an environment: observation, stages, reward terms, limits, numbers; as rows, and as text."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from tabulate import tabulate
+
+from dora.configs import plain
+
+Rows = list[list[str]]
+"""Cells of a table, a list for each row; the first row is the head."""
+
+
+def observation_rows(env: Any) -> Rows:
+    """Entries of the observation: columns, name, size, unit, meaning, and with what they exist."""
+    s, start = env.observed, 0
+    rows = [["index", "entry", "size", "unit", "meaning", "exists"]]
+    for name, entry in env.observation_entries.items():
+        size = entry.value(s).shape[-1]
+        who = "prior" if entry.prior else "guided" if entry.guided else "both"
+        rows.append([f"{start}-{start + size - 1}", f"`{name}`", str(size), entry.unit, entry.doc, who])
+        start += size
+    return rows
+
+
+def stage_rows(env: Any) -> Rows:
+    """The stages with the time for which each has to hold, and where it falls back to."""
+    rows = [["stage", "held for [s]", "falls back to"]]
+    for stage in env.machine.stages:
+        held = f"{max(stage.hold, env.config.dt):g}"
+        rows.append([f"`{stage.name}`", held, f"`{stage.back_to}`" if stage.back_to else "never"])
+    return rows
+
+
+def term_rows(env: Any) -> Rows:
+    """The reward's terms in force."""
+    rows = [["term", "part", "weight", "meaning", "exists"]]
+    for name, term in env.terms.terms.items():
+        rows.append([f"`{name}`", term.part, f"{term.weight:g}", term.doc, "guided" if term.guided else "both"])
+    return rows
+
+
+def limit_rows(env: Any) -> Rows:
+    """Rates and limits of an episode."""
+    c, steps = env.config, env.max_steps
+    return [
+        ["what", "value"],
+        ["control / physics", f"{c.control_frequency} / {c.physics_frequency} Hz"],
+        ["episode", f"{steps} steps, {steps * c.dt:g} s"],
+        ["solver position iterations", str(c.solver_iterations)],
+        ["largest penetration of a success", f"{c.penetration_limit * 1000:g} mm"],
+    ]
+
+
+def config_rows(env: Any) -> Rows:
+    """The numbers in force, under the names with which they can be overridden."""
+    return [["number", "value"], *([name, value] for name, value in _flat(plain(env.config)))]
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", ", ".join(f"{x:g}" for x in value) if isinstance(value, list) else f"{value:g}"
+
+
+TABLES = {
+    "stages": stage_rows,
+    "reward terms": term_rows,
+    "observation": observation_rows,
+    "limits": limit_rows,
+    "numbers": config_rows,
+}
+"""What is told about an environment, in order."""
+
+
+def describe(env: Any) -> str:
+    """The tables in force as text."""
+    parts = ", ".join(sorted(env.parts)) or "none"
+    head = f"{type(env).__name__}: {env.num_envs} environments, guidance {parts}"
+    if not hasattr(env, "arms"):
+        return head
+    tables = [
+        f"{title}\n{tabulate(rows(env), headers='firstrow', disable_numparse=True)}" for title, rows in TABLES.items()
+    ]
+    return "\n\n".join([head, *(table.replace("`", "") for table in tables)])

@@ -1,0 +1,436 @@
+"""The environment of every Dora task: it has an MDP, a scene, an arm with a guide for each robot, and perturbations.
+
+It reads the simulator once per control step; then only pure functions of that snapshot decide.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, cast
+
+import gymnasium as gym
+import numpy as np
+import sapien
+import torch
+from gymnasium import spaces
+from jaxtyping import Bool, Float, Int
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs.types import SimConfig
+from torch import Tensor
+
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.reach.feasibility_table import ReachTable
+from dora.errors import InputError
+from dora.sim.batch.actions import check_array
+from dora.tasks.env.arm import Arm
+from dora.tasks.env.arm_group import ArmGroup
+from dora.tasks.env.description import describe
+from dora.tasks.env.options import check_options, task_config
+from dora.tasks.env.perturbations import Perturbations
+from dora.tasks.env.scene import SCALE_DRAW, TaskScene, film_camera, sim_config
+from dora.tasks.env.state import resize, restore, saved_state
+from dora.tasks.env.task import Task
+from dora.tasks.guidance.guide import Guide
+from dora.tasks.mdp.config import TaskConfig
+from dora.tasks.mdp.guidance_parts import FILTER, REWARD
+from dora.tasks.mdp.observations import observation_table
+from dora.tasks.mdp.rewards import Terms
+from dora.tasks.mdp.snapshot import Snapshot, advanced
+from dora.tasks.mdp.stages import StageMachine
+
+MM = 1000.0
+"""Millimetres per metre."""
+
+
+class DoraEnv(BaseEnv):
+    """The environment of one or several arms that has a task; one class per registered id, made by `register_task`.
+
+    Args:
+        guidance: "affordance" puts candidates into observation, reward and action; "none" removes exactly that.
+        guidance_parts: which parts of guidance="affordance" are in force, among "observation", "reward", "filter"
+            and "prior"; all by default.
+        hand_joints: 20 independent hand targets, or 15 with distal joints coupled to medial ones.
+        preset: how much episodes are randomised, see `dora.tasks.mdp.randomisation`.
+        config: numbers that differ from the task's own, by name (nested for weights and randomisation), or all of
+            them as an instance of the task's `CONFIG`.
+        grasps: candidates in place of those that come with Dora, of the task's object and robot; one arm only.
+        robot_uids: name of a folder in `robots/`, or a tuple with one for each arm.
+        sim_backend: as in ManiSkill; "auto" on a machine without CUDA is "physx_cpu", or "physx_cpu_batch" for
+            num_envs > 1.
+        kwargs: everything else that `BaseEnv` takes.
+
+    Raises:
+        InputError: for an unknown guidance, hand, preset, robot, control mode or name in `config`, or num_envs < 1.
+    """
+
+    SUPPORTED_REWARD_MODES = ("dense", "normalized_dense", "sparse", "none", "paper")
+    SUPPORTED_ROBOTS: ClassVar[list[Any]] = ["diana7_hit"]
+
+    TASK: ClassVar[type[Task]]
+    """What the environment is about; set by `register_task`."""
+
+    agent: Any
+    """ManiSkill's: a `DescribedRobot`, or a `MultiAgent` of them."""
+    task: Any
+    """The task that it has, an instance of `TASK`."""
+    narrow: Callable[[Tensor], Tensor] | None = None
+    """Takes the (b, c) candidates that b new episodes may use and returns fewer; to try candidates one by one."""
+    _snapshot: Snapshot | None = None
+    _observed: Snapshot
+
+    def __init__(
+        self,
+        *args: Any,
+        guidance: str = "affordance",
+        guidance_parts: Sequence[str] | None = None,
+        hand_joints: int = 20,
+        preset: str = "standard",
+        config: Mapping[str, Any] | TaskConfig | None = None,
+        grasps: GraspCandidates | None = None,
+        robot_uids: Any = "diana7_hit",
+        num_envs: int = 1,
+        control_mode: str | None = None,
+        sim_backend: str = "auto",
+        render_backend: str = "auto",
+        render_mode: str | None = None,
+        obs_mode: str | None = None,
+        **kwargs: Any,
+    ):
+        options = check_options(
+            guidance, guidance_parts, hand_joints, task_config(self.TASK.CONFIG, preset, config), robot_uids,
+            len(self.TASK.ARMS), num_envs, control_mode, sim_backend, render_backend, render_mode, obs_mode,
+        )  # fmt: skip
+        self.parts, self.config, self._grasps = options.parts, options.config, grasps
+        self.task = self.TASK(self.config)
+        self._shares: dict[str, float] = {}
+        self._tables: dict[str, ReachTable] = {}
+        self._forced_scale: Tensor | None = None
+        several = len(options.robots) > 1
+        super().__init__(
+            *args,
+            num_envs=num_envs,
+            robot_uids=options.robots if several else options.robots[0],  # pyright: ignore[reportArgumentType]
+            control_mode=(options.control_mode,) * len(options.robots) if several else options.control_mode,  # pyright: ignore[reportArgumentType]
+            sim_backend=options.sim_backend,
+            render_backend=options.render_backend,
+            render_mode=render_mode,
+            obs_mode=obs_mode,
+            **kwargs,
+        )
+        if several:  # one action for all arms, as learners want it
+            bound = np.ones((num_envs, self.action_size), np.float32)
+            self.single_action_space = spaces.Box(-bound[0], bound[0])
+            self.action_space = spaces.Box(-bound, bound) if num_envs > 1 else self.single_action_space
+
+    # ------------------------------------------------------------------- scene
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        return sim_config(self.config)
+
+    @property
+    def _default_human_render_camera_configs(self) -> CameraConfig:
+        return film_camera(*self.task.CAMERA)
+
+    def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
+        poses: Any = [sapien.Pose(arm.position, arm.quaternion) for arm in self.task.ARMS.values()]
+        super()._load_agent(options, poses)
+        for agent in getattr(self.agent, "agents", [self.agent]):
+            if self.task.WRIST_MOTION is not None and agent.commands_wrist:
+                agent.wrist_controller.set_motion(*self.task.WRIST_MOTION, feed_forward=True)
+
+    def _load_scene(self, options: dict) -> None:
+        task, names = self.task, tuple(dict.fromkeys(arm.object for arm in self.task.ARMS.values()))
+        scene = self.task_scene = TaskScene(self.scene, self.num_envs, self.config, self._draw_scale(len(names)))
+        for k, name in enumerate(names):
+            scene.add(name, task.build(scene, name, self.scale[:, k].cpu().numpy()))
+        self.mdp = task.make_mdp(scene)
+        self.machine = StageMachine(self.mdp.stages, self.num_envs, self.config.dt, self.device)
+        terms = self.mdp.paper_terms if self._reward_mode == "paper" else self.mdp.terms
+        self.terms: Terms[Any] = terms if REWARD in self.parts else terms.without_guidance()
+        self.observation_entries = observation_table(tuple(task.ARMS), self.mdp.observations, self.parts)
+        agents = getattr(self.agent, "agents", [self.agent])
+        scene.make_arms(task, agents, self.parts, self._grasps, self._tables)
+        self.anneal(**self._shares)
+        scene.make_reader(task)
+        self.memory = scene.make_memory(self.action_size)
+        hands = {name: len(arm.agent.description.hand) for name, arm in self.arms.items()}
+        size = self.num_envs, self.action_size
+        self.perturbations = Perturbations(self.config.randomisation, *size, hands, self.config.dt, self.device)
+
+    def _draw_scale(self, objects: int) -> Float[Tensor, "n objects"]:
+        """Relative sizes, one draw from each environment's own stream."""
+        if self._forced_scale is not None:
+            return self._forced_scale
+        draws = np.asarray(self._batched_episode_rng.uniform(size=(SCALE_DRAW + objects - 1,)))
+        share = 2 * draws.reshape(self.num_envs, -1)[:, SCALE_DRAW - 1 :] - 1
+        return torch.tensor(1 + self.config.randomisation.size * share, dtype=torch.float32, device=self.device)
+
+    def rebuild(self, scale: Float[Tensor, "n objects"]) -> None:
+        """Builds the scene anew with objects of these relative sizes; begins new episodes."""
+        self._forced_scale = scale
+        super().reset(options={"reconfigure": True})
+        self._forced_scale = None
+
+    @property
+    def scale(self) -> Float[Tensor, "n objects"]:
+        """Sizes of the objects relative to their nominal ones."""
+        return self.task_scene.scale
+
+    @property
+    def objects(self) -> dict[str, Actor]:
+        """The objects by name."""
+        return self.task_scene.objects
+
+    @property
+    def arms(self) -> ArmGroup:
+        """The arms by name."""
+        return self.task_scene.arms
+
+    @property
+    def target_object(self) -> Actor:
+        """The only object; ValueError if there are several."""
+        return self.task_scene.object
+
+    @property
+    def arm(self) -> Arm:
+        """The only arm; ValueError if there are several."""
+        return self.arms.only
+
+    @property
+    def guide(self) -> Guide:
+        """The guide of the only arm; ValueError if there are several."""
+        return self.arm.guide
+
+    @property
+    def action_size(self) -> int:
+        """Number of action components, of all arms in order."""
+        return self.arms.action_size
+
+    def anneal(self, **shares: float) -> None:
+        """Sets shares in [0, 1] for curricula, kept from now on: `bounds` of the residual, `error` of the candidates.
+
+        Raises:
+            InputError: for a share outside [0, 1].
+        """
+        self._shares |= shares
+        self.arms.anneal(**shares)
+
+    # ----------------------------------------------------------------- reading
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The state after the last control step or reset; read from the simulator at most once."""
+        if self._snapshot is None:
+            self._snapshot, self._observed = self._read(self._elapsed_steps)
+        return self._snapshot
+
+    @property
+    def observed(self) -> Snapshot:
+        """The same state with the noise of the sensors: what the policy and the references know of it."""
+        _ = self.snapshot
+        return self._observed
+
+    def _read(self, step: Int[Tensor, " n"]) -> tuple[Snapshot, Snapshot]:
+        """The true state and the observed one after so many control steps."""
+        s = self.task.extended(self.task_scene.snapshot(self.machine, self.memory, step / self.task.MAX_STEPS))
+        return s, self.perturbations.observed(s, self.arms.choices, step)
+
+    # ------------------------------------------------------------------- reset
+
+    def reset(self, seed: Any = None, options: dict | None = None) -> tuple[Any, dict[str, Any]]:
+        """As in ManiSkill, but a seeded reset builds the scene anew: PhysX remembers earlier contacts, and would
+        not repeat a trajectory bit for bit otherwise. A partial reset (`options["env_idx"]`) takes no seed.
+
+        Raises:
+            InputError: if a seed comes together with `env_idx`, since ManiSkill would reseed every environment.
+        """
+        if seed is not None and options and "env_idx" in options:
+            raise InputError("a partial reset (env_idx) cannot take a seed: it would reseed every environment")
+        seeds = seed if seed is None or isinstance(seed, int) else list(seed)
+        gym.Env.reset(self, seed=seeds[0] if isinstance(seeds, list) else seeds)  # gymnasium's own generator
+        self._snapshot = None
+        if seed is not None and "reset_to_env_states" not in (options or {}):
+            options = {**(options or {}), "reconfigure": True}
+        return super().reset(seed=seeds, options=options)
+
+    def _initialize_episode(self, env_idx: Tensor, options: dict) -> None:
+        place, mass, friction, error, key = self._draws(env_idx)
+        for arm in self.arms.values():
+            arm.agent.robot.set_qpos(arm.home_joints().expand(len(env_idx), -1))
+            arm.rest(env_idx)
+        self.task.place(self.task_scene, env_idx, place)
+        self.memory.begin(env_idx, {name: body.pose.p[env_idx] for name, body in self.objects.items()})
+        low, high = self.config.randomisation.friction
+        for k, name in enumerate(self.objects):
+            nominal = self.task_scene.nominal_masses(name)[env_idx]
+            self.memory.objects[name].write(
+                env_idx, mass=self.task.masses(name, nominal, mass[:, k]), friction=low + (high - low) * friction[:, k]
+            )
+        self.task_scene.apply_properties(self.memory, env_idx)
+        self.machine.reset(env_idx)
+        self.perturbations.begin(env_idx, key[:, 0])
+        errors = (2 * error - 1).split([choice.error_draws for choice in self.arms.choices.values()], -1)
+        for arm, e in zip(self.arms.values(), errors, strict=True):
+            pose = self.objects[arm.spec.object].pose
+            p, q = pose.p[env_idx], pose.q[env_idx]
+            arm.choose(env_idx, p, q, self.task.reachable(arm, p, q), e, self.config.randomisation, self.narrow)
+
+    def _draws(self, env_idx: Tensor) -> tuple[Tensor, ...]:
+        """Uniform numbers of new episodes (b, ...): place, masses, friction, candidates' errors, key of the noise.
+
+        One draw per environment from its own stream: neither num_envs nor the others' resets change it.
+        """
+        errors = sum(choice.error_draws for choice in self.arms.choices.values())
+        parts = [self.task.DRAWS, len(self.objects), len(self.objects), errors, 1]
+        assert sum(parts) < SCALE_DRAW
+        draws = np.asarray(self._batched_episode_rng[env_idx.cpu().numpy()].uniform(size=(sum(parts),)))
+        u = torch.as_tensor(draws, dtype=torch.float32, device=self.device).reshape(len(env_idx), sum(parts))
+        return u.split(parts, -1)
+
+    # -------------------------------------------------------------------- step
+
+    def step(self, action: Any) -> tuple[Any, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """One control step with the action (n, a), or (a,) for one environment; None moves no command.
+
+        Returns:
+            Observation ((n, o) with `obs_mode="state"`), reward (n,), terminated (n,), truncated (n,) and info.
+
+        Raises:
+            InputError: if the action has another shape, or holds NaN or infinity; nothing is moved then.
+        """
+        return super().step(action)
+
+    def _step_action(self, action: Any) -> Any:
+        action, step = self._checked(action), self._elapsed_steps
+        self.task.remember(self.snapshot)
+        command = None
+        if action is not None:
+            self.memory.record_action(action)
+            command = self.arms.commands(self.observed, self.perturbations.delayed(action, step))
+        else:
+            self.arms.hold()
+        self.task_scene.push(self.perturbations.pushes(step, len(self.objects)))
+        super()._step_action(command)
+        collected = float(self.control_freq if self.task.CONTACT_EVERY_STEP else self.sim_freq)
+        self.task_scene.reader.record(self.memory, collected)
+        s, observed = self._read(step + 1)  # ManiSkill counts the step after this method
+        for name, o in s.objects.items():
+            self.memory.record_rise(name, o.p[:, 2] - o.start_p[:, 2])
+        self.machine.advance(s)
+        stage, phases = self.machine.index.clone(), self.arms.advance(observed)
+        self._snapshot = advanced(s, stage, phases)
+        self._observed = self._snapshot if observed is s else advanced(observed, stage, phases)
+        return action
+
+    def _checked(self, action: Any) -> Tensor | None:
+        """The action as an (n, a) tensor; InputError for a wrong shape or a value that is not finite."""
+        if action is None:
+            return None
+        out = torch.as_tensor(action, dtype=torch.float32, device=self.device)
+        check_array(out, self.single_action_space, self.num_envs)
+        return out.reshape(self.num_envs, self.action_size)
+
+    def scripted_action(self) -> Float[Tensor, "n a"]:
+        """Action that executes the chosen candidates from the present state: the scripted solution."""
+        return self.arms.scripted_action(self.observed)
+
+    # ------------------------------------------------------ evaluation, reward
+
+    @property
+    def unreachable(self) -> Bool[Tensor, " n"]:
+        """No candidate of some arm could be reached when the episode began. Such an episode fails at once and earns
+        nothing (paper, Motion-Feasibility Filtering); never so without that part of guidance."""
+        none_left = self.arms.out_of_reach
+        return none_left if FILTER in self.parts else torch.zeros_like(none_left)
+
+    def evaluate(self) -> dict[str, Tensor]:
+        """Success as the MDP says, failure, stages and overlap.
+
+        Idempotent: reset and wrappers call it too, so it moves nothing.
+        """
+        s, memory, finished, unreachable = self.snapshot, self.memory, self.machine.finished, self.unreachable
+        info = {
+            "success": self.mdp.succeeded(finished, s, memory) & ~unreachable,
+            "fail": self.mdp.failed(s, memory) | unreachable,
+            "unreachable": unreachable,
+            "finished": finished,
+            "stage": self.machine.index.clone(),
+            "penetration_mm": memory.episode.penetration * MM,
+            "penetration_max_mm": memory.max_penetration * MM,
+        }
+        for k, stage in enumerate(self.machine.stages):
+            info[f"stage/{stage.name}"] = self.machine.furthest > k
+        return info
+
+    def compute_dense_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
+        """Sum of the terms (n,); each one's share goes into `info["reward/<name>"]`."""
+        total, parts = self.terms(self.snapshot)
+        weight = (~self.unreachable).float()
+        info.update({f"reward/{name}": weight * value for name, value in parts.items()})
+        return weight * total
+
+    def compute_normalized_dense_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
+        """The dense reward over its largest possible value."""
+        return self.compute_dense_reward(obs, action, info) / self.terms.upper
+
+    def get_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
+        """(n,) reward of the chosen mode; "paper" sums the printed terms."""
+        if self._reward_mode == "paper":
+            return self.compute_dense_reward(obs, action, info)
+        return super().get_reward(obs, action, info) * ~self.unreachable
+
+    # ------------------------------------------------------------- observation
+
+    def _get_obs_agent(self) -> dict[str, Tensor]:
+        return {}
+
+    def _get_obs_extra(self, info: dict) -> dict[str, Tensor]:
+        s = self.observed
+        return {name: entry.value(s) for name, entry in self.observation_entries.items()}
+
+    def _flatten_raw_obs(self, obs: Any) -> Any:
+        if self._obs_mode == "state":
+            return torch.cat(list(obs["extra"].values()), -1)
+        return super()._flatten_raw_obs(obs)
+
+    # ------------------------------------------------ the protocol of learners
+
+    @property
+    def max_steps(self) -> int:
+        """Episode limit [control steps]."""
+        return self.task.MAX_STEPS
+
+    @property
+    def stage_names(self) -> tuple[str, ...]:
+        """Names of the stages, in order."""
+        return tuple(stage.name for stage in self.machine.stages)
+
+    @property
+    def logged(self) -> tuple[str, ...]:
+        """Names of the (n,) tensors in `step`'s info that are worth a curve."""
+        stages = [f"stage/{name}" for name in self.stage_names]
+        names = (*(f"reward/{name}" for name in self.terms.terms), *stages, "penetration_mm", "finished")
+        return (*names, "unreachable") if FILTER in self.parts else names
+
+    # ------------------------------------------------------------------- state
+
+    def get_state_dict(self) -> dict:
+        """Simulator, controller and task state; a round trip restores stage and observation."""
+        return saved_state(self, cast(dict[str, Any], super().get_state_dict()))  # annotated as a tensor
+
+    def set_state_dict(self, state: dict, env_idx: Tensor | None = None) -> None:
+        """Inverse of `get_state_dict`; with `env_idx` (b,) the state has b rows.
+
+        Where the state's objects have another size, the scene is built anew with those sizes.
+        """
+        rows = torch.arange(self.num_envs, device=self.device) if env_idx is None else env_idx
+        resize(self, state, rows)
+        partial = {} if env_idx is None else {"env_idx": env_idx}
+        super().set_state_dict({k: state[k] for k in ("actors", "articulations")}, **partial)
+        restore(self, state, rows)
+        self._snapshot = None
+
+    def __str__(self) -> str:
+        """The tables in force: stages, terms with weights, observations, limits, numbers."""
+        return describe(self)

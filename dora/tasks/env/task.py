@@ -1,0 +1,120 @@
+"""What a task is: the numbers, the arms, how its scene is built and started, and the MDP; and its registration."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from mani_skill.utils.structs import Actor, Link
+from torch import Tensor
+
+from dora.affordance.bundled_sets import load_candidates
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.reach.feasibility_table import Grid
+from dora.robot import RobotDescription
+from dora.tasks.env.arm import Arm, ArmSpec
+from dora.tasks.guidance.grasp_and_lift import GraspReference
+from dora.tasks.guidance.reference import Reference
+from dora.tasks.mdp.config import TaskConfig
+from dora.tasks.mdp.mdp import Mdp
+from dora.tasks.mdp.snapshot import Snapshot
+
+if TYPE_CHECKING:
+    from dora.tasks.env.scene import TaskScene
+
+
+class Task(ABC):
+    """One task of one environment, which has it; a subclass says what is built and asked for.
+
+    Args:
+        config: the numbers in force, an instance of `CONFIG`.
+    """
+
+    CONFIG: ClassVar[type[TaskConfig]] = TaskConfig
+    """The task's numbers."""
+    ARMS: ClassVar[Mapping[str, ArmSpec]]
+    """The arms by name, each with the object that it handles."""
+    DRAWS: ClassVar[int]
+    """How many uniform random numbers one initial state needs, besides mass, friction and errors."""
+    MAX_STEPS: ClassVar[int]
+    """Episode limit [control steps]."""
+    LEARNERS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"ppo": {}, "sac": {}}
+    """The learners that can do the task with their recommended settings, as differences from the defaults; the first
+    is the recommended one."""
+    CONTACT_POINTS: ClassVar[int] = 0
+    """Contact points of hand and object that the snapshot holds; 0 if the task asks for none."""
+    CONTACT_EVERY_STEP: ClassVar[bool] = False
+    """Whether contacts are collected from all physics steps of a control step: blows are shorter than that."""
+    WRIST_MOTION: ClassVar[tuple[float, float] | None] = None
+    """Wrist speed [m/s] and spin [rad/s] of a full action, told to the drives as well; the controller's own if None."""
+    CAMERA: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]]] = (
+        (1.05, 0.62, 0.48),
+        (0.42, 0.02, 0.2),
+    )
+    """Eye and target of the camera of films [m]."""
+
+    def __init__(self, config: Any):
+        self.config = config
+
+    @abstractmethod
+    def make_mdp(self, scene: "TaskScene") -> Mdp[Any]:
+        """Stages, reward terms, observations, failure; called once per scene, after its objects are built."""
+
+    @abstractmethod
+    def place(self, scene: "TaskScene", rows: Int[Tensor, " b"], u: Float[Tensor, "b d"]) -> None:
+        """Puts the objects of the environments `rows` where `u` (b, DRAWS) in [0, 1) says."""
+
+    def candidates(self, arm: str) -> GraspCandidates:
+        """Grasps with which an arm may handle its object; all that come with the object by default."""
+        return load_candidates(self.ARMS[arm].object)
+
+    def adapted(self, candidates: GraspCandidates, arm: str, robot: RobotDescription) -> GraspCandidates:
+        """The same grasps as an arm executes them in this task."""
+        return candidates
+
+    def build(self, scene: "TaskScene", name: str, scale: Float[np.ndarray, " n"]) -> Actor:
+        """Builds an object into every sub-scene, `scale` times its size; the folder of that name by default."""
+        return scene.build(name, scale)
+
+    def world(self, scene: "TaskScene") -> Sequence[Actor | Link]:
+        """What objects and hands may touch besides each other; asked once per scene, after `build`."""
+        return [scene.table]
+
+    def make_reference(self, scene: "TaskScene", arm: str) -> Reference:
+        """What leads the hand of an arm along its chosen candidate; called once per scene."""
+        return GraspReference(scene.num_envs, self.config.dt, scene.device)
+
+    def start_grid(self) -> Grid | None:
+        """Where the objects may stand at the start, for the table of f_reach; None where they do not stand."""
+        return None
+
+    def masses(self, name: str, nominal: Float[Tensor, " b"], u: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
+        """Masses of new episodes [kg] from an object's nominal ones and uniform random numbers."""
+        return nominal * (1 + self.config.randomisation.mass * (2 * u - 1))
+
+    def reachable(
+        self, arm: Arm, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]
+    ) -> Bool[Tensor, "b c"]:
+        """f_reach: which candidates an arm can carry out when its object stands like this."""
+        if (table := arm.reach_table) is not None:
+            return table.mask(object_p, object_q)
+        count = len(arm.guide.choice.candidates)
+        return torch.ones(len(object_p), count, dtype=torch.bool, device=object_p.device)
+
+    def extended(self, s: Snapshot) -> Snapshot:
+        """The snapshot with what this task reads in addition: a subclass of `Snapshot`. Changes nothing."""
+        return s
+
+    def remember(self, s: Snapshot) -> None:  # noqa: B027 (most tasks need not)
+        """Takes note of the present state before a control step moves it."""
+
+    def stateful(self) -> dict[str, Any]:
+        """What a task remembers of an episode by itself; each has get_state() and set_state(state, rows)."""
+        return {}
+
+
+def short_name(env_id: str) -> str:
+    """What the files about a Dora id are called: DoraCube-v1 -> cube."""
+    return env_id.removeprefix("Dora").split("-")[0].lower()

@@ -1,0 +1,160 @@
+"""DoraHammer-v1's stages and reward terms: pure functions of a `HammerSnapshot`."""
+
+from math import pi
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dora.tasks.hammer.snapshot import (
+    HammerSnapshot,
+    face_to_nail,
+    fingers_on,
+    misalignment,
+    off_centre,
+    relative_speed,
+    tip_distance,
+)
+from dora.tasks.mdp.memory import EpisodeMemory
+from dora.tasks.mdp.rewards import Term, Terms, tolerance
+from dora.tasks.mdp.snapshot import Snapshot, derived
+from dora.tasks.mdp.stages import Stage
+from dora.tasks.mdp.terms import at_candidate, near_region, paper_affordance, paper_grasp, paper_penalty, penalties
+
+if TYPE_CHECKING:
+    from dora.tasks.hammer.task import HammerConfig
+
+CATCH, STABILISE, ORIENT, STRIKE = range(4)
+"""Indices of the stages."""
+
+
+def stages(c: "HammerConfig") -> list[Stage[HammerSnapshot]]:
+    """The sub-tasks, in order."""
+
+    def caught(s: HammerSnapshot) -> Tensor:
+        return in_hand(s, c) & (relative_speed(s) < c.caught_speed)
+
+    def still(s: HammerSnapshot) -> Tensor:
+        return in_hand(s, c) & (s.drift_p < c.still[0]) & (s.drift_r < c.still[1])
+
+    def oriented(s: HammerSnapshot) -> Tensor:
+        return in_hand(s, c) & (misalignment(s) < c.aligned) & above_nail(s, c)
+
+    def lost(s: HammerSnapshot) -> Tensor:
+        return off_centre(s) > c.lost
+
+    def driven(s: HammerSnapshot) -> Tensor:
+        return s.nail_driven >= c.nail.driven
+
+    return [
+        Stage("catch", lambda s: tolerance(off_centre(s), (0.0, 0.02), 0.3), caught, hold=c.caught_time),
+        Stage("stabilise", lambda s: steadiness(s, c), still, lost=lost, back_to="catch"),
+        Stage("orient", poise, oriented, hold=c.hold_time, lost=lost, back_to="catch"),
+        Stage("strike", lambda s: driven_share(s, c), driven, lost=lost, back_to="catch"),
+    ]
+
+
+def terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
+    """The reward."""
+    w, limit = c.weights, f"{1000 * c.penetration_limit:g} mm"
+
+    def catch(s: HammerSnapshot) -> Tensor:
+        return tolerance(off_centre(s), (0.0, 0.02), 0.3) * (0.5 + 0.1 * fingers_on(s))
+
+    def still(s: HammerSnapshot) -> Tensor:
+        return torch.where(s.stage > STRIKE, 1.0, steadiness(s, c))
+
+    def orient(s: HammerSnapshot) -> Tensor:
+        held = in_hand(s, c) & (s.stage >= ORIENT)
+        return torch.where(s.stage > STRIKE, 1.0, held * poise(s))
+
+    def clean(s: HammerSnapshot) -> Tensor:
+        return (s.max_penetration <= c.penetration_limit).float()
+
+    def strike(s: HammerSnapshot) -> Tensor:
+        return driven_share(s, c) * (c.after_overlap + (1 - c.after_overlap) * clean(s))
+
+    def driven(s: HammerSnapshot) -> Tensor:
+        return ((s.nail_driven >= c.nail.driven) & (s.stage > STRIKE)).float() * clean(s)
+
+    return Terms(
+        {
+            "affordance": Term(
+                lambda s: near_region(tip_distance(s)), w.affordance, "affordance", True,
+                "exp(-alpha * sum of fingertip distances to the handle)",
+            ),
+            "candidate": Term(
+                lambda s: at_candidate(s, s.stage >= ORIENT), w.candidate, "task", True,
+                "closeness of the wrist to the candidate until the hammer is held",
+            ),
+            "catch": Term(catch, w.catch, doc="handle near the middle of the hand, and fingers on it"),
+            "still": Term(still, w.still, doc="the hammer does not move in the hand"),
+            "orient": Term(
+                orient, w.orient,
+                doc="closeness of theta, the angle from striking axis to nail axis, and of the face to the nail",
+            ),
+            "strike": Term(
+                strike, w.strike,
+                doc=f"depth driven by blows, saturating; {c.after_overlap:g} of it after an overlap above {limit}",
+            ),
+            "driven": Term(
+                driven, w.driven, doc=f"all stages done, and no overlap above {limit} so far"
+            ),
+            **penalties(w, c.free_overlap, c.penetration_limit),
+        }
+    )  # fmt: skip
+
+
+def paper_terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
+    """The printed reward."""
+    return Terms(
+        {
+            **paper_affordance(lambda s: s.object.p + (s.butt + s.neck) / 2),
+            **paper_grasp(ORIENT),
+            "orient": Term(
+                lambda s: (1 - misalignment(s) / pi) * (s.stage >= ORIENT),
+                1.0,
+                doc="-theta with theta = arccos(2 <r, r*>^2 - 1), the rotation left, over pi and plus one",
+            ),
+            "strike": Term(lambda s: driven_share(s, c), 1.0, doc="depth driven by blows"),
+            **paper_penalty(),
+        }
+    )
+
+
+def failed(s: Snapshot, memory: EpisodeMemory, c: "HammerConfig") -> Bool[Tensor, " n"]:
+    """The hammer has fallen."""
+    return s.object.p[:, 2] < c.fallen
+
+
+@derived
+def in_hand(s: HammerSnapshot, c: "HammerConfig") -> Bool[Tensor, " n"]:
+    """The handle is in the hand, touched by two fingers."""
+    return (off_centre(s) < c.in_hand) & (fingers_on(s) >= 2)
+
+
+def above_nail(s: HammerSnapshot, c: "HammerConfig") -> Bool[Tensor, " n"]:
+    """The striking face is over the nail's head."""
+    away = face_to_nail(s)
+    height = -away[:, 2]
+    return (away[:, :2].norm(dim=-1) < c.beside) & (height > c.height[0]) & (height < c.height[1])
+
+
+def driven_share(s: HammerSnapshot, c: "HammerConfig") -> Float[Tensor, " n"]:
+    """Share of the depth to which blows must drive the nail, saturating."""
+    return (s.nail_driven / c.nail.driven).clamp(0, 1)
+
+
+@derived
+def steadiness(s: HammerSnapshot, c: "HammerConfig") -> Float[Tensor, " n"]:
+    """How little the held hammer moves in the hand, 0 to 1."""
+    shift = tolerance(s.drift_p, (0.0, c.still[0]), 0.05)
+    return in_hand(s, c) * shift * tolerance(s.drift_r, (0.0, c.still[1]), 0.5)
+
+
+@derived
+def poise(s: HammerSnapshot) -> Float[Tensor, " n"]:
+    """How near the hammer is to a blow: striking axis to nail axis, face to nail, 0 to 1."""
+    turn = tolerance(misalignment(s), margin=pi)
+    return turn * tolerance(face_to_nail(s).norm(dim=-1), (0.0, 0.05), 0.6)

@@ -1,0 +1,307 @@
+"""DoraHammer-v1: its numbers, its scene with the nail, how hammers are released, and what it observes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from math import pi
+from typing import Any, ClassVar
+
+import numpy as np
+import sapien
+import torch
+from jaxtyping import Bool, Float
+from mani_skill.utils.structs import Actor, Link, Pose
+from torch import Tensor
+
+from dora.affordance.bundled_sets import best_candidates
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.objects.catalogue import load_object
+from dora.geometry.poses import relative
+from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
+from dora.robot import RobotDescription
+from dora.tasks.env.arm import Arm, ArmSpec
+from dora.tasks.env.registration import register_task
+from dora.tasks.env.scene import TaskScene
+from dora.tasks.env.task import Task
+from dora.tasks.guidance.reference import Reference
+from dora.tasks.hammer.ballistics import Strike
+from dora.tasks.hammer.mdp import failed, paper_terms, stages, terms
+from dora.tasks.hammer.nail import Nail, NailSettings
+from dora.tasks.hammer.reach import with_waiting_hand, within_reach
+from dora.tasks.hammer.reference import CatchReference, CatchSettings
+from dora.tasks.hammer.snapshot import (
+    HammerSnapshot,
+    face_to_nail,
+    handle_axis,
+    nail_in_hand,
+    striking_axis,
+    tip_distance,
+)
+from dora.tasks.mdp.buffers import Buffers
+from dora.tasks.mdp.config import PenaltyWeights, TaskConfig
+from dora.tasks.mdp.mdp import Mdp
+from dora.tasks.mdp.observations import Entry
+from dora.tasks.mdp.quantities import turned_in_wrist
+from dora.tasks.mdp.snapshot import Snapshot, extended
+
+CLASS = "HandleGrasp"
+"""The grasp class that the task asks for."""
+UNKNOWN = 1e3
+"""Motion in the hand before the window is full [m]."""
+NOMINAL_FRICTION = 0.9
+"""Friction of the hammer as built [1]; every episode sets its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HammerWeights(PenaltyWeights):
+    """Weights of the reward terms."""
+
+    affordance: float = 0.2
+    """Fingertips near the handle [1]."""
+    candidate: float = 0.3
+    """Wrist at the candidate [1]."""
+    catch: float = 0.4
+    """Handle in the hand [1]."""
+    still: float = 0.4
+    """No motion of the hammer in the hand [1]."""
+    orient: float = 1.0
+    """Hammer over the nail, face down [1]."""
+    strike: float = 2.0
+    """Depth driven by blows [1]."""
+    driven: float = 1.5
+    """The nail is driven in [1]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HammerConfig(TaskConfig):
+    """Numbers of the task."""
+
+    control_frequency: int = 40
+    """Control steps per second [Hz]."""
+    physics_frequency: int = 240
+    """Physics steps per second [Hz]; a multiple of the control frequency."""
+    solver_iterations: int = 8
+    """PhysX position iterations [1]."""
+    contact_offset: float = 0.010
+    """Distance at which PhysX begins to see a contact of a body without its own setting [m]."""
+    release: tuple[float, float, float] = (0.50, -0.15, 0.60)
+    """Middle of the open hand, over which the hammer is released [m]."""
+    spread: float = 0.04
+    """Half width of the release's horizontal place [m]."""
+    fall: tuple[float, float] = (0.10, 0.25)
+    """Height of the handle's lower end above that point at the release [m]."""
+    tilt: float = 0.10
+    """Largest tilt of the handle at the release about each horizontal axis [rad]."""
+    roll: float = 0.3
+    """Largest turn about the handle at the release [rad]."""
+    spin: float = 0.5
+    """Largest angular velocity at the release about each axis [rad/s]."""
+    window: float = 0.25
+    """Time over which the hammer's motion in the hand is measured [s]."""
+    in_hand: float = 0.07
+    """Distance of the handle's axis from the middle of the hand up to which the hammer is in the hand [m]."""
+    caught_speed: float = 0.5
+    """Speed of the hammer in the hand below which it has been caught [m/s]."""
+    caught_time: float = 0.075
+    """Time for which it must be so [s]."""
+    still: tuple[float, float] = (0.008, 0.15)
+    """Motion within the window up to which the hammer is held still [m], [rad]."""
+    aligned: float = pi / 12
+    """Angle between striking axis and nail axis up to which the hammer is oriented [rad]."""
+    beside: float = 0.015
+    """Horizontal distance of the striking face from the nail up to which it is over the nail [m]."""
+    height: tuple[float, float] = (-0.005, 0.15)
+    """Height of the face above the nail between which it counts as over the nail [m]."""
+    hold_time: float = 0.25
+    """Time for which the hammer must be held over the nail [s]."""
+    lost: float = 0.12
+    """Distance of the handle from the middle of the hand at which the hammer is lost [m]."""
+    fallen: float = 0.15
+    """Height of the hammer's centre below which it has fallen [m]."""
+    free_overlap: float = 0.001
+    """Overlap that costs no reward [m]."""
+    after_overlap: float = 0.3
+    """Share of what blows earn that is left once an overlap was above the limit [1]."""
+    swing_radius: float = 0.36
+    """Distance of the swing's axis from the nail [m]."""
+    fewest_catches: float = 0.5
+    """Share of executed episodes that a ranked candidate must have survived to be used [1]."""
+    most_candidates: int = 24
+    """Stored candidates that the task works with [1]."""
+    nail: NailSettings = field(default_factory=NailSettings)
+    """Numbers of the nail."""
+    reference: CatchSettings = field(default_factory=CatchSettings)
+    """Numbers of the reference."""
+    weights: HammerWeights = field(default_factory=HammerWeights)
+    """Weights of the reward terms."""
+
+
+@register_task("DoraHammer-v1")
+class HammerTask(Task):
+    """Catch a falling hammer with the five-fingered hand, bring it over a nail, and drive the nail into its post.
+
+    **Randomisations:** place (+-4 cm), height (10 to 25 cm above the hand), tilt, roll and spin of the hammer when it
+    is released; size, mass, friction and candidate error by preset.
+
+    **Stages:** catch (the handle is in the hand, touched by two fingers, slower than 0.5 m/s in it, for 0.075 s),
+    stabilise (moves less than 8 mm and 0.15 rad in the hand within 0.25 s), orient (striking axis within 15 degrees
+    of the nail axis and face within 15 mm above the nail, for 0.25 s), strike (blows drive the nail 10 mm; its motion
+    within 50 ms after an impact above 0.5 m/s counts).
+
+    **Success:** all stages done, and no overlap above 5 mm in the whole episode.
+
+    **Failure:** the hammer has fallen.
+    """
+
+    CONFIG = HammerConfig
+    ARMS: ClassVar[Mapping[str, ArmSpec]] = {"arm": ArmSpec("hammer", home="catch")}
+    DRAWS = 9
+    MAX_STEPS = 320
+    CONTACT_EVERY_STEP = True
+    WRIST_MOTION = (1.5, 6.0)
+    CAMERA = ((1.15, 0.65, 0.75), (0.48, -0.12, 0.42))
+    LEARNERS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "sac": {
+            "total_steps": 300_000, "stop_success": 0.97, "num_envs": 32, "eval_every": 75_000, "eval_episodes": 100,
+            "eval_envs": 50,
+        },
+        "ppo": {
+            "total_steps": 600_000, "stop_success": 0.97, "num_envs": 64, "eval_every": 150_000, "eval_episodes": 100,
+            "eval_envs": 50, "learner": {"rollout": 32, "log_std": -1.8},
+        },
+    }  # fmt: skip
+
+    nail: Nail
+    points: dict[str, Float[Tensor, "n 3"]]
+    """Centre of the striking face, and ends of the handle's axis, in the hammer's frame [m]."""
+    history: Buffers
+    """Poses of the hammer in the hand within the window."""
+
+    def make_mdp(self, scene: TaskScene) -> Mdp[HammerSnapshot]:
+        c: HammerConfig = self.config
+        return Mdp(stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS, partial(failed, c=c))
+
+    def candidates(self, arm: str) -> GraspCandidates:
+        return best_candidates("hammer", CLASS, self.config.fewest_catches, self.config.most_candidates)
+
+    def adapted(self, candidates: GraspCandidates, arm: str, robot: RobotDescription) -> GraspCandidates:
+        """The hand waits wide open, in the posture in which the arm starts."""
+        return with_waiting_hand(candidates, robot, self.ARMS[arm].home)
+
+    def reachable(
+        self, arm: Arm, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]
+    ) -> Bool[Tensor, "b c"]:
+        """f_reach: which candidates the hand can wait with below a hammer that is released like this."""
+        return within_reach(arm.guide.choice.candidates, object_p, object_q, *arm.home)
+
+    def make_reference(self, scene: TaskScene, arm: str) -> Reference:
+        c: HammerConfig = self.config
+        strike = Strike(torch.tensor(c.nail.top, device=scene.device), self.points["face"], c.swing_radius)
+        return CatchReference(scene.num_envs, strike, c.nail.driven, c.dt, scene.device, c.reference)
+
+    def build(self, scene: TaskScene, name: str, scale: Float[np.ndarray, " n"]) -> Actor:
+        """Hammer and nail."""
+        c, hammer = self.config, load_object(name)
+        handle = hammer.region("handle").bounds
+        x, y = handle.mean(0)[:2]
+        factor = torch.tensor(scale, dtype=torch.float32, device=scene.device)[:, None]
+        points = {"face": hammer.centroid("face"), "butt": (x, y, handle[0, 2]), "neck": (x, y, handle[1, 2])}
+        self.points = {
+            key: factor * torch.tensor(np.asarray(p), dtype=torch.float32, device=scene.device)
+            for key, p in points.items()
+        }
+        above = sapien.Pose([*c.release[:2], c.release[2] + 0.5])
+        actor = scene.build(name, scale, friction=NOMINAL_FRICTION, pose=above)
+        self.nail = Nail(scene.scene, c.nail, 1 / c.physics_frequency)
+        self.nail.strike_with(actor, self.points["face"].cpu().numpy())
+        self.history = Buffers(scene.num_envs, scene.device, history=(1 + round(c.window / c.dt), 7))
+        return actor
+
+    def world(self, scene: TaskScene) -> Sequence[Actor | Link]:
+        return [scene.table, *self.nail.links]
+
+    def place(self, scene: TaskScene, rows: Tensor, u: Tensor) -> None:
+        """Releases hammers (b,) over the hand and puts the nail back.
+
+        `u` (b, 9) in [0, 1): x, y and height of the handle's lower end [m], tilt about x and y and roll [rad], spin
+        [rad/s], world frame.
+        """
+        c, u = self.config, 2 * u - 1
+        height = (c.fall[0] + c.fall[1]) / 2 + u[:, 2] * (c.fall[1] - c.fall[0]) / 2
+        middle = torch.tensor(c.release, device=scene.device).repeat(len(rows), 1)
+        middle[:, :2] += c.spread * u[:, :2]
+        middle[:, 2] += height - self.points["butt"][rows, 2]
+        zero = torch.zeros_like(height)
+        tilt = quaternion_from_rotation_vector(c.tilt * torch.stack([u[:, 3], u[:, 4], zero], -1))
+        roll = quaternion_from_rotation_vector(c.roll * torch.stack([zero, zero, u[:, 5]], -1))
+        scene.object.set_pose(Pose.create_from_pq(middle, quaternion_multiply(tilt, roll)))
+        scene.object.set_linear_velocity(torch.zeros_like(middle))
+        scene.object.set_angular_velocity(c.spin * u[:, 6:9])
+        self.nail.begin(rows)
+        self.history.write(rows, history=UNKNOWN)
+
+    # ------------------------------------------------------------------ reading
+
+    def extended(self, s: Snapshot) -> HammerSnapshot:
+        """The snapshot with the nail (top in the world, depth [m]), points of the hammer, its motion in the hand."""
+        depth = self.nail.depth
+        nail_p = torch.tensor(self.config.nail.top, device=depth.device).repeat(len(depth), 1)
+        nail_p[:, 2] -= depth
+        drift_p, drift_r = self._drift(s)
+        return extended(
+            s, HammerSnapshot, nail_p=nail_p, nail_depth=depth, nail_driven=self.nail.driven,
+            drift_p=drift_p, drift_r=drift_r, **self.points,
+        )  # fmt: skip
+
+    def _drift(self, s: Snapshot) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """Motion of the hammer in the hand since the beginning of the window [m], [rad]; UNKNOWN before it is full."""
+        history = self.history.history
+        rows, oldest = torch.arange(len(history), device=history.device), (self._step(s) + 1) % history.shape[1]
+        p, q = relative((s.hand.wrist_p, s.hand.wrist_q), (s.object.p, s.object.q))
+        old_p, old_q = history[rows, oldest].split([3, 4], -1)
+        known = old_p[:, 0] < UNKNOWN
+        drift_r = rotation_angle(torch.where(known[:, None], old_q, q), q)
+        return (p - old_p).norm(dim=-1), torch.where(known, drift_r, UNKNOWN)
+
+    def remember(self, s: Snapshot) -> None:
+        """Notes the pose of the hammer in the hand in the present control step."""
+        history = self.history.history
+        rows, now = torch.arange(len(history), device=history.device), self._step(s) % history.shape[1]
+        history[rows, now] = torch.cat(relative((s.hand.wrist_p, s.hand.wrist_q), (s.object.p, s.object.q)), -1)
+
+    def _step(self, s: Snapshot) -> Tensor:
+        """Number of the control step in its episode (n,)."""
+        return (s.time * self.MAX_STEPS).round().long()
+
+    def stateful(self) -> dict[str, Any]:
+        return {"nail": self.nail, "history": self.history}
+
+
+def _nail_axis(s: HammerSnapshot) -> Tensor:
+    down = torch.tensor([0.0, 0.0, -1.0], device=s.hand.wrist_p.device)
+    return turned_in_wrist(s, down.expand_as(s.hand.wrist_p))
+
+
+def _axes(s: HammerSnapshot) -> Tensor:
+    return torch.cat([striking_axis(s), handle_axis(s)], -1)
+
+
+def _nail_depths(s: HammerSnapshot) -> Tensor:
+    return torch.stack([s.nail_depth, s.nail_driven], -1) * 100
+
+
+def _drifts(s: HammerSnapshot) -> Tensor:
+    return torch.stack([s.drift_p.clamp(max=0.1) * 10, s.drift_r.clamp(max=1)], -1)
+
+
+OBSERVATIONS: dict[str, Entry] = {
+    "length": Entry(lambda s: s.object.half[:, 2:], "m", "half length of the hammer"),
+    "nail": Entry(nail_in_hand, "m", "the nail's head in the hand frame"),
+    "nail_depth": Entry(_nail_depths, "cm", "depth of the nail, and how much of it blows have driven"),
+    "drift": Entry(_drifts, "dm, rad", "motion of the hammer in the hand within 0.25 s"),
+    "handle": Entry(tip_distance, "m", "distance of each fingertip's surface from the handle's", True),
+    "face": Entry(face_to_nail, "m", "striking face to the nail's head, world frame", True),
+    "axes": Entry(_axes, "1", "striking and handle axis, world frame", True),
+    "nail_axis": Entry(_nail_axis, "1", "nail axis in the hand frame", True),
+}
+"""What the task observes beyond the common entries; the guided ones are the affordance frame."""

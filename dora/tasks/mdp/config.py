@@ -1,0 +1,54 @@
+"""The numbers of a task as a frozen dataclass: weights, thresholds, randomisation, rates; overridden by name."""
+
+from dataclasses import dataclass, field
+
+from dora.tasks.mdp.randomisation import Randomisation
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResidualBounds:
+    """Largest residual actions."""
+
+    position: float = 0.03
+    """Of the wrist along each axis [m]."""
+    rotation: float = 0.2
+    """Of the wrist about each axis [rad]."""
+    joint: float = 0.3
+    """Of a hand joint [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig:
+    """Numbers that every task has; a task adds its own fields."""
+
+    control_frequency: int = 20
+    """Control steps per second [Hz]."""
+    physics_frequency: int = 100
+    """Physics steps per second [Hz]; a multiple of the control frequency."""
+    solver_iterations: int = 6
+    """PhysX position iterations [1]."""
+    contact_offset: float = 0.005
+    """Distance at which PhysX begins to see a contact of a body without its own setting [m]."""
+    penetration_limit: float = 0.005
+    """Largest overlap in an episode that counts as a success [m]."""
+    residual: ResidualBounds = field(default_factory=ResidualBounds)
+    """Bounds of the residual action."""
+    randomisation: Randomisation = field(default_factory=Randomisation)
+    """How much episodes are randomised and perturbed; the preset's numbers, unless they are overridden."""
+
+    @property
+    def dt(self) -> float:
+        """Duration of a control step [s]."""
+        return 1 / self.control_frequency
+
+
+@dataclass(frozen=True, kw_only=True)
+class PenaltyWeights:
+    """Weights of the penalty terms of every task; negative."""
+
+    effort: float = -0.05
+    """Mean square of the action [1]."""
+    change: float = -0.4
+    """Mean square of the action's change [1]."""
+    penetration: float = -1.0
+    """Overlap beyond what is free [1]."""

@@ -1,0 +1,55 @@
+"""A task's Markov decision process as data: stages, reward terms, observations, failure and success."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from dora.tasks.mdp.memory import EpisodeMemory
+from dora.tasks.mdp.observations import Entry
+from dora.tasks.mdp.rewards import Terms
+from dora.tasks.mdp.snapshot import S, Snapshot
+from dora.tasks.mdp.stages import Stage
+
+BELOW_TABLE = -0.05
+"""Height below which an object has left the table [m]."""
+KNOCKED_AWAY = 0.6
+"""Horizontal distance from its start at which an object has been knocked out of reach [m]."""
+
+
+def left_table(s: Snapshot, memory: EpisodeMemory) -> Bool[Tensor, " n"]:
+    """An object has left the table or the robot's reach; nothing can mend the episode."""
+    lost = []
+    for o in s.objects.values():
+        away = (o.p[:, :2] - o.start_p[:, :2]).norm(dim=-1)
+        lost.append((o.p[:, 2] < BELOW_TABLE) | (away > KNOCKED_AWAY))
+    return torch.stack(lost).any(0)
+
+
+@dataclass(frozen=True)
+class Mdp(Generic[S]):
+    """What a task asks for; everything is a pure function of a snapshot and of what the episode remembers.
+
+    Attributes:
+        stages: the sub-tasks, in order.
+        terms: the reward's terms.
+        paper_terms: the printed reward, corrected (`reward_mode="paper"`).
+        penetration_limit: largest overlap in an episode that counts as a success [m].
+        observations: entries beyond those of every task.
+        failed: snapshot, memory -> (n,) bool: nothing can mend the episode.
+    """
+
+    stages: Sequence[Stage[Any]]
+    terms: Terms[Any]
+    paper_terms: Terms[Any]
+    penetration_limit: float
+    observations: Mapping[str, Entry] = field(default_factory=dict)
+    failed: Callable[[Any, EpisodeMemory], Bool[Tensor, " n"]] = left_table
+
+    def succeeded(self, finished: Bool[Tensor, " n"], s: S, memory: EpisodeMemory) -> Bool[Tensor, " n"]:
+        """All stages are done, no overlap of the episode was above the limit, and nothing has failed now, as a jug
+        that is dropped again has."""
+        return finished & (memory.max_penetration <= self.penetration_limit) & ~self.failed(s, memory)
