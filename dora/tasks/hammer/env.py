@@ -133,6 +133,7 @@ class HammerEnv(DoraEnv):
     CONTACT_OFFSET = 0.010
     CONTACT_EVERY_STEP = True
     HOME = "catch"
+    OBJECT = "hammer"
     WRIST_SPEED = 1.5
     """Linear wrist speed of a full action [m/s]."""
     WRIST_SPIN = 6.0
