@@ -86,7 +86,7 @@ def read_ply(path: Path) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"] | None]
 def _labels(faces: Any) -> np.ndarray | None:
     """The labels among the properties of all faces: columns of an array (binary files) or of a mapping (text)."""
     names = faces if isinstance(faces, dict) else faces.dtype.names or ()
-    return np.array(faces[LABEL]) if LABEL in names else None
+    return np.array(faces[LABEL]).reshape(-1) if LABEL in names else None
 
 
 def _check(path: Path, vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray | None) -> None:
