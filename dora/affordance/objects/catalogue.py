@@ -32,8 +32,11 @@ def object_places() -> dict[str, Path]:
     found: dict[str, Path] = {}
     extra = [Path(part) for part in os.environ.get(SEARCH_VARIABLE, "").split(os.pathsep) if part]
     for place in filter(Path.is_dir, [own_objects(), *extra]):
-        found |= {file.stem: file for file in sorted(place.iterdir()) if file.suffix.lower() in MESHES}
-        found |= {file.parent.name: file.parent for file in sorted(place.glob(f"*/{OBJECT_FILE}"))}
+        for path in sorted(place.iterdir()):
+            if path.suffix.lower() in MESHES:
+                found[path.stem] = path
+            elif (path / OBJECT_FILE).is_file():
+                found[path.name] = path
     return found
 
 

@@ -34,9 +34,9 @@ MOST_ROUNDS = 20
 POOL = 240
 """Grasps of the target region that are ranked."""
 KEPT = 96
-"""The best of them that are shipped."""
+"""The best of them that are bundled."""
 FEWEST = 64
-"""Grasps of the target region below which nothing is shipped."""
+"""Grasps of the target region below which nothing is bundled."""
 PLACES = Grid((0.55, 0.0), (0.08, 0.08), spacing=0.08, yaws=12)
 """Where objects on a table may stand: a grasp has to be feasible somewhere."""
 FEASIBLE = 0.03
@@ -44,7 +44,7 @@ FEASIBLE = 0.03
 OTHERS = 64
 """Candidates searched for each other region."""
 OTHERS_KEPT = 32
-"""The best of them that are shipped."""
+"""The best of them that are bundled."""
 
 
 Usable = Callable[[GraspCandidates], Bool[Tensor, " c"]]
@@ -52,7 +52,7 @@ Usable = Callable[[GraspCandidates], Bool[Tensor, " c"]]
 
 
 def make_bundle(name: str, seed: int, phases: PhaseProgress, usable: Usable | None = None) -> Path:
-    """Make and write the shipped set of an object; returns its file.
+    """Make and write the bundled set of an object; returns its file.
 
     Args:
         name: of an object or its folder, as for `load_object`.
@@ -70,7 +70,7 @@ def make_bundle(name: str, seed: int, phases: PhaseProgress, usable: Usable | No
 
 
 class SetMaker:
-    """Makes the shipped set of one object for one robot; `usable` as of `make_bundle`."""
+    """Makes the bundled set of one object for one robot; `usable` as of `make_bundle`."""
 
     def __init__(
         self, obj: AffordanceObject, robot: RobotDescription, phases: PhaseProgress, usable: Usable | None = None
