@@ -25,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "objects" / "box"
 
 
-def edited(old: str, new: str) -> Callable[[Path], None]:
+def edited(old: str, new: str) -> Callable[[Path], object]:
     """Damage: other text in object.toml."""
 
     def damage(folder: Path) -> None:
@@ -36,14 +36,14 @@ def edited(old: str, new: str) -> Callable[[Path], None]:
     return damage
 
 
-def swapped(mesh: trimesh.Trimesh, labels: list[int] | None = None, name: str = "mesh.ply") -> Callable[[Path], None]:
+def swapped(mesh: trimesh.Trimesh, labels: list[int] | None = None, name: str = "mesh.ply") -> Callable[[Path], object]:
     """Damage: another mesh."""
     return lambda folder: write_ply(folder / name, mesh, None if labels is None else np.array(labels))
 
 
-def cut(name: str, size: int) -> Callable[[Path], None]:
+def cut(name: str, size: int) -> Callable[[Path], object]:
     """Damage: only the first bytes of a file."""
-    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:size]) and None
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:size])
 
 
 BOX = two_regions().mesh
@@ -54,12 +54,12 @@ QUADS = (
     "ply\nformat ascii 1.0\nelement vertex 4\nproperty double x\nproperty double y\nproperty double z\n"
     "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3\n"
 )
-DAMAGES: dict[str, tuple[Callable[[Path], None], str, str]] = {
+DAMAGES: dict[str, tuple[Callable[[Path], object], str, str]] = {
     "no toml": (lambda f: (f / "object.toml").unlink(), "box", "has no object.toml"),
     "no TOML at all": (edited("format =", "format"), "object.toml", "not valid TOML"),
-    "not text": (lambda f: (f / "object.toml").write_bytes(b"\xff\xfe\0") and None, "object.toml", "not valid TOML"),
-    "deep": (lambda f: (f / "object.toml").write_text("a=" + "[" * 9000) and None, "object.toml", "not valid TOML"),
-    "large toml": (lambda f: (f / "object.toml").write_text("#" * 1_000_001) and None, "object.toml", "1000000 bytes"),
+    "not text": (lambda f: (f / "object.toml").write_bytes(b"\xff\xfe\0"), "object.toml", "not valid TOML"),
+    "deep": (lambda f: (f / "object.toml").write_text("a=" + "[" * 9000), "object.toml", "not valid TOML"),
+    "large toml": (lambda f: (f / "object.toml").write_text("#" * 1_000_001), "object.toml", "1000000 bytes"),
     "long number": (edited("mass = 0.2", "mass = " + "9" * 5000), "object.toml", "not valid TOML"),
     "unknown key": (edited("mass =", "colour = 3\nmass ="), "object.toml", "unknown key 'colour'; known: format, name"),
     "missing key": (edited("mass =", "# mass ="), "object.toml", "lacks the key 'mass'"),
@@ -99,7 +99,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], str, str]] = {
     "short mesh": (cut("mesh.ply", 700), "mesh.ply", "no intact PLY file"),
     "header alone": (cut("mesh.ply", 100), "mesh.ply", "no intact PLY file"),
     "another file": (lambda f: BOX.export(f / "mesh.ply", file_type="stl"), "mesh.ply", "no intact PLY file"),
-    "quads": (lambda f: (f / "mesh.ply").write_text(QUADS) and None, "mesh.ply", "must hold triangles"),
+    "quads": (lambda f: (f / "mesh.ply").write_text(QUADS), "mesh.ply", "must hold triangles"),
     "open": (swapped(OPEN, HALF[1:]), "mesh.ply", "no closed surface"),
     "inside out": (swapped(INSIDE_OUT, HALF), "mesh.ply", "no closed surface with outward faces"),
     "millimetres": (swapped(trimesh.Trimesh(BOX.vertices * 1000, BOX.faces), HALF), "mesh.ply", "use metres"),
