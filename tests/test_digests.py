@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from dora.affordance.bundled_sets import data_folder, load_candidates
+from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.candidates import hand_digest
-from dora.affordance.objects.catalogue import available_objects
+from dora.affordance.objects.catalogue import available_objects, own_objects
+from dora.affordance.reach.feasibility_table import file_name
 from dora.agents.checkpoint import read_checkpoint
 from dora.digests import KEY, digest_of
 from dora.robot import load_robot
@@ -78,7 +79,7 @@ def test_bundled_tables_of_feasibility_are_found(env_id: str):
     table = task.arm.reach_table
     task.close()
     assert table is not None
-    assert (data_folder() / f"reach-{table.digest[:16]}.safetensors").is_file()
+    assert (own_objects() / task.OBJECT / file_name(table.digest)).is_file()
 
 
 @pytest.mark.parametrize("path", POLICIES, ids=lambda p: p.parent.name)

@@ -49,7 +49,11 @@ def script() -> ModuleType:
         ("--object jug --out /proc/nowhere/a.safetensors", "choose another --out"),
         ("--object jug --robot ur5", "unknown robot 'ur5'"),
         ("--mesh nowhere.stl", "nowhere.stl"),
-        ("--ship", "no object ''"),
+        ("--object hamer", "no object 'hamer'; did you mean hammer? choose one of: cube, hammer, jug, microwave"),
+        ("--make-bundle", "need --object"),
+        ("--rank-in-task --mesh a.stl", "need --object"),
+        ("--rank-in-task --object spoon", "no object 'spoon'"),
+        ("--rank-in-task --object microwave", "no task uses the object 'microwave'"),
     ],
 )
 def test_bad_input(
@@ -66,7 +70,7 @@ def test_bad_input(
     assert captured.out == ""
 
 
-@pytest.mark.parametrize("arguments", ["--object spoon", "--validate isaac", "--no-such-option 1"])
+@pytest.mark.parametrize("arguments", ["--validate isaac", "--ship", "--no-such-option 1"])
 def test_errors_of_the_parser(script: ModuleType, monkeypatch: pytest.MonkeyPatch, arguments: str):
     with pytest.raises(SystemExit) as exit_info:
         call(script, monkeypatch, *arguments.split())

@@ -5,10 +5,21 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dora.affordance.bundled_sets import data_folder, load_candidates
+from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.candidates import concatenate
+from dora.affordance.objects.catalogue import load_object, own_objects
+from dora.affordance.reach.feasibility_table import file_name
+from dora.errors import InputError
 from dora.tasks import make_task
-from dora.tools.task_ranking import TASKS, TaskRanking, _Balanced, rank_in_task, ranked
+from dora.tools.task_ranking import (
+    TaskRanking,
+    _Balanced,
+    rank_bundled_set,
+    rank_in_task,
+    ranked,
+    tasks_of,
+    usable_in_task,
+)
 
 
 def test_a_proof_tells_a_good_grasp_from_one_in_the_air():
@@ -50,13 +61,25 @@ def test_among_equals_the_one_reached_more_often_is_first():
     torch.testing.assert_close(best_first.position, two.position[[1, 0]])
 
 
-@pytest.mark.parametrize("env_id", [TASKS["cube"], TASKS["jug"]])
+@pytest.mark.parametrize("env_id", ["DoraCube-v1", "DoraJug-v1"])
 def test_the_table_of_reachable_candidates_comes_along(env_id: str):
     task = make_task(env_id, 1)
     table = task.arm.reach_table
     task.close()
     assert table is not None
-    assert (data_folder() / f"reach-{table.digest[:16]}.safetensors").is_file()
+    assert (own_objects() / task.OBJECT / file_name(table.digest)).is_file()
     feasible = table.reason == 0
     print(f"{feasible.any(1).float().mean():.2f} of the starts, {feasible.sum(1).float().mean():.1f} candidates each")
     assert feasible.any(1).float().mean() > 0.95
+
+
+def test_tasks_say_which_object_they_use():
+    found = {name: tasks_of(load_object(name)) for name in ("cube", "hammer", "jug", "microwave")}
+    assert found == {"cube": ["DoraCube-v1"], "hammer": ["DoraHammer-v1"], "jug": ["DoraJug-v1"], "microwave": []}
+    assert tasks_of(replace(load_object("jug"), mass=1.0)) == []  # another jug than the task's
+    assert [name for name in found if usable_in_task(name) is not None] == ["hammer"]
+
+
+def test_ranking_needs_a_task():
+    with pytest.raises(InputError, match="no task uses the object 'microwave'"):
+        rank_bundled_set("microwave", lambda title: pytest.fail(title))

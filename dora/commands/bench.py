@@ -41,7 +41,7 @@ def bench_grasp(object: str = "cube", robot: str = "diana7_hit", json: bool = Fa
     """Grasp candidates per second on one core, against plain pytorch_kinematics and trimesh.
 
     Args:
-        object: cube, jug, hammer or microwave.
+        object: name of an object, or the path of its folder or mesh.
         robot: folder of the robot.
         json: print one JSON object on the last line instead of a table.
     """

@@ -1,6 +1,7 @@
 """Generate grasps of an object, judge them, and store them.
 
     python experiments/grasps.py --object jug --num 256 --validate sapien --out runs/jug.safetensors
+    python experiments/grasps.py --object my/mug                 # the folder of an object of your own
     python experiments/grasps.py --mesh mug.glb --labels mug.yaml --units mm --region handle
 
 Prints a table with baselines beside it (searches without E_DFC, without closing the hand around the object, and of one
@@ -15,7 +16,7 @@ from typing import Annotated, Literal
 import tyro
 
 from dora.affordance.objects.affordance_object import AffordanceObject
-from dora.affordance.objects.catalogue import load_object
+from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.importing import import_object
 from dora.errors import InputError
 from dora.progress import PhaseProgress
@@ -23,7 +24,7 @@ from dora.robot import load_robot
 from dora.sim.grasp_tests.bundle_maker import make_bundle
 from dora.sim.grasp_tests.generation import baselines, by_region, generate, summary, voting_summary
 from dora.sim.grasp_tests.report import check_out, print_report, write_report
-from dora.tools.task_ranking import TASKS, rank_bundled_set, usable_in_task
+from dora.tools.task_ranking import rank_bundled_set, tasks_of, usable_in_task
 
 INTERRUPTED = 130  # exit status after Ctrl-C
 BAD_INPUT = 2  # exit status after input that a person can mend
@@ -32,10 +33,10 @@ ANY = "any"  # value of --region for a free search
 
 @dataclass
 class Args:
-    """Generate grasps of one of our objects (--object) or of a mesh (--mesh)."""
+    """Generate grasps of an object (--object) or of a mesh (--mesh)."""
 
-    object: Literal["cube", "jug", "hammer", "microwave"] | None = None
-    """One of our objects; "microwave" is the handle of a microwave's door."""
+    object: str | None = None
+    """Name of an object in objects/ or in a folder of DORA_OBJECTS, or the path of an object's folder or mesh."""
     mesh: Path | None = None
     """Your own mesh: OBJ, STL, PLY or GLB, closed or nearly so."""
     labels: Path | None = None
@@ -45,7 +46,7 @@ class Args:
     seed: int = 0
     """Seed of all random draws."""
     region: str | None = None
-    """Region to hold, or "any" (default: what the task wants of our objects, any of a mesh)."""
+    """Region to hold, or "any" (default: the target of --object, any of --mesh)."""
     scale: float = 1.0
     """Factor of all lengths of --mesh."""
     units: Literal["m", "cm", "mm", "in"] = "m"
@@ -62,10 +63,10 @@ class Args:
     """Candidates of a search for each other region and of a free one, simulated as well: how often each region is held
     with and without asking for it, and how well the vote tells (needs --validate sapien)."""
     make_bundle: bool = False
-    """Make the set that comes with Dora for --object instead: enough valid grasps, ranked by simulated lifts; then
-    what --prove does, where the object has a task with a table."""
+    """Make the bundled set of --object instead, grasps.safetensors in its folder: enough valid grasps, ranked by
+    simulated lifts or holds; then what --rank-in-task does, where a task uses the object."""
     rank_in_task: bool = False
-    """Execute the set that comes with Dora for --object in its task, and rank it by the episodes that succeed."""
+    """Execute the bundled set of --object in the task that uses it, and rank it by the episodes that succeed."""
 
 
 def target(args: Args) -> tuple[AffordanceObject, str | None]:
@@ -118,20 +119,22 @@ def run(args: Args) -> None:
 
 
 def remake(args: Args) -> None:
-    """Make or prove the shipped set of an object."""
-    name = args.object or ""
-    if not args.make_bundle and name not in TASKS:
-        raise InputError(f"--prove needs --object, one of {', '.join(TASKS)}: no task proves {name!r}.")
+    """Make or rank the bundled set of an object."""
+    if args.object is None or args.mesh is not None:
+        raise InputError("--make-bundle and --rank-in-task need --object, for example --object jug, and no --mesh.")
+    name = args.object
+    ids = tasks_of(load_object(name))
     with PhaseProgress() as phases:
         if args.make_bundle:
             print(make_bundle(name, args.seed, phases, usable_in_task(name)))
-        if name in TASKS:
+        if args.rank_in_task or ids:
             print(rank_bundled_set(name, lambda title: phases.phase(title, "episodes")))
 
 
 def main() -> int:
     """Run the command; returns the exit status."""
-    args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
+    description = f"{__doc__}\nObjects: {', '.join(available_objects())}."
+    args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=description)
     try:
         if args.make_bundle or args.rank_in_task:
             remake(args)

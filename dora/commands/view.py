@@ -1,11 +1,12 @@
 """Show an object, its regions and its grasps on a web page.
 
-    python experiments/view.py jug                                  # one of our objects with its shipped grasps
+    python experiments/view.py jug                                  # an object with its bundled grasps
     python experiments/view.py runs/grasps/jug.safetensors          # what experiments/grasps.py wrote
+    python experiments/view.py my/mug                               # the folder of an object of your own
     python experiments/view.py mug.glb --labels mug.yaml            # the regions of your own mesh
     python experiments/view.py runs/grasps/mug.safetensors --mesh mug.glb --labels mug.yaml
     python experiments/view.py jug --pictures runs/pictures         # PNG files instead of a page
-    python experiments/view.py --pictures runs/pictures             # one PNG of all our objects
+    python experiments/view.py --pictures runs/pictures             # one PNG of all objects
 
 Runs until Ctrl-C.
 """
@@ -18,7 +19,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from dora.affordance.bundled_sets import load_candidates
+from dora.affordance.bundled_sets import GRASPS_FILE
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import available_objects, load_object
@@ -26,7 +27,7 @@ from dora.affordance.objects.importing import import_object
 from dora.affordance.views.album import write_album, write_objects
 from dora.affordance.views.page import GraspPage
 from dora.errors import InputError
-from dora.robot import load_robot
+from dora.robot import RobotDescription, load_robot
 
 BAD_INPUT = 2  # exit status after input that a person can mend
 GRASPS = ".safetensors"  # suffix of a file of grasps
@@ -37,14 +38,14 @@ class Args:
     """Show an object, its regions and its grasps on a web page."""
 
     source: tyro.conf.Positional[str | None] = None
-    """An object (cube, jug, hammer, microwave), a file of grasps (.safetensors) or a mesh file; none with --pictures:
-    all our objects."""
+    """Name of an object, the path of an object's folder, a file of grasps (.safetensors) or a mesh file; none with
+    --pictures: all objects that have a name."""
     port: int = 8080
     """TCP port of the page."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 lets other machines see the page."""
     mesh: Path | None = None
-    """Mesh of a file of grasps that is not of one of our objects."""
+    """Mesh, or folder of the object, of a file of grasps whose object has no name in objects/ or DORA_OBJECTS."""
     labels: Path | None = None
     """Regions of the mesh, as for experiments/grasps.py."""
     scale: float = 1.0
@@ -52,7 +53,7 @@ class Args:
     units: Literal["m", "cm", "mm", "in"] = "m"
     """Unit of length of --mesh; GLB files are in metres."""
     pictures: Path | None = None
-    """Folder: write PNGs of regions, of four grasps and of their contact semantic maps there, or one of all our objects
+    """Folder: write PNGs of regions, of four grasps and of their contact semantic maps there, or one of all objects
     (objects.png), and serve no page."""
     robot: str = "diana7_hit"
     """Robot whose hand is shown: a folder name in robots/ or a path."""
@@ -63,17 +64,12 @@ def content(args: Args) -> tuple[AffordanceObject, GraspCandidates | None]:
     robot = load_robot(args.robot)
     if args.source is None:
         raise InputError("Say what to show: an object, a file of grasps or a mesh file, for example jug.")
-    if args.source in available_objects():
-        return load_object(args.source), load_candidates(args.source, robot)
     path = Path(args.source)
-    if not path.is_file():
-        known = ", ".join(available_objects())
-        raise InputError(f"{args.source} is neither an object ({known}) nor a file: give one of them.")
-    if path.suffix != GRASPS:
-        return import_object(path, labels=args.labels, scale=args.scale, units=args.units), None
+    if path.suffix != GRASPS or args.source in available_objects():
+        return with_bundle(opened(args, args.source), robot)
     name = GraspCandidates.load(path).object
     if args.mesh is not None:
-        obj = import_object(args.mesh, labels=args.labels, scale=args.scale, units=args.units)
+        obj = opened(args, str(args.mesh))
     elif name in available_objects():
         obj = load_object(name)
     else:
@@ -81,9 +77,23 @@ def content(args: Args) -> tuple[AffordanceObject, GraspCandidates | None]:
     return obj, GraspCandidates.load(path, obj, robot)
 
 
+def opened(args: Args, source: str) -> AffordanceObject:
+    """An object by its name or folder, or from a mesh file with the options for meshes."""
+    if Path(source).is_file() and source not in available_objects():
+        return import_object(source, labels=args.labels, scale=args.scale, units=args.units)
+    return load_object(source)
+
+
+def with_bundle(obj: AffordanceObject, robot: RobotDescription) -> tuple[AffordanceObject, GraspCandidates | None]:
+    """An object and the grasps in its folder, if there are any."""
+    path = None if obj.folder is None else obj.folder / GRASPS_FILE
+    return obj, None if path is None or not path.is_file() else GraspCandidates.load(path, obj, robot)
+
+
 def main() -> int:
     """Serve the page until Ctrl-C; returns the exit status."""
-    args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
+    description = f"{__doc__}\nObjects: {', '.join(available_objects())}."
+    args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=description)
     try:
         if args.source is None and args.pictures is not None:
             print(write_objects(args.pictures))

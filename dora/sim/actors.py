@@ -25,7 +25,7 @@ ROUGHNESS = 0.5
 def object_entity(
     obj: AffordanceObject,
     scale: float = 1.0,
-    friction: float = 0.7,
+    friction: float | None = None,
     mass: float | None = None,
     contact_offset: float = CONTACT_OFFSET,
     visible: bool = False,
@@ -38,7 +38,7 @@ def object_entity(
     Args:
         obj: the object.
         scale: factor of all lengths; mass does not follow it.
-        friction: coefficient, static and dynamic.
+        friction: coefficient, static and dynamic; the object's own if None.
         mass: mass [kg]; the object's own if None.
         contact_offset: distance at which PhysX begins to look for contacts [m].
         visible: whether the mesh is drawn, region by region; needs a renderer.
@@ -47,7 +47,8 @@ def object_entity(
         InputError: a number is not positive, or a piece is no convex body.
     """
     kilograms = obj.mass if mass is None else mass
-    for name, value in (("scale", scale), ("mass", kilograms), ("friction", friction)):
+    coefficient = obj.friction if friction is None else friction
+    for name, value in (("scale", scale), ("mass", kilograms), ("friction", coefficient)):
         if not value > 0:
             raise InputError(f"{obj.name}: {name} is {value}; it must be positive.")
     entity = sapien.Entity()
@@ -55,7 +56,7 @@ def object_entity(
     body: Any = physx.PhysxRigidDynamicComponent()
     for index, piece in enumerate(obj.pieces):
         try:
-            shape = collision_shape(piece.shape, physx.PhysxMaterial(friction, friction, 0.0), scale)
+            shape = collision_shape(piece.shape, physx.PhysxMaterial(coefficient, coefficient, 0.0), scale)
         except RuntimeError as error:
             raise InputError(f"{obj.name}: piece {index} ({piece.label}) is no convex body; decompose it.") from error
         shape.set_contact_offset(contact_offset)
@@ -112,7 +113,7 @@ def build_object(
     name: str | None = None,
     pose: sapien.Pose | None = None,
     scale: float | Sequence[float] | np.ndarray = 1.0,
-    friction: float = 0.7,
+    friction: float | None = None,
     mass: float | None = None,
     contact_offset: float = CONTACT_OFFSET,
 ) -> Actor:
@@ -124,7 +125,7 @@ def build_object(
         name: name of the actor, the object's by default.
         pose: where it is first; at rest on a table of height 0 under the origin by default.
         scale: factor of all lengths, one for all environments or one for each.
-        friction: coefficient, static and dynamic.
+        friction: coefficient, static and dynamic; the object's own if None.
         mass: mass [kg]; the object's own if None.
         contact_offset: as in `object_entity`.
 

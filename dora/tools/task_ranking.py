@@ -13,18 +13,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dora.affordance.bundled_sets import bundled_path, data_folder, load_candidates
+from dora.affordance.bundled_sets import bundled_path, load_candidates
 from dora.affordance.candidates import GraspCandidates, concatenate
-from dora.affordance.objects.catalogue import load_object
-from dora.affordance.search.optimise import OFF_TABLE
+from dora.affordance.objects.catalogue import AffordanceObject, load_object
+from dora.affordance.reach.feasibility_table import file_name
+from dora.errors import InputError
 from dora.parallel import run_cases
-from dora.tasks import make_task
+from dora.tasks import find_task, make_task, task_ids
 from dora.tasks.env.env import DoraEnv
 
-TASKS = {"cube": "DoraCube-v1", "jug": "DoraJug-v1", "hammer": "DoraHammer-v1"}
-"""The task in which the grasps of an object are executed."""
 FIRST_TRIES, MORE_TRIES = 6, 30
-"""Episodes per grasp of a proof that makes a shipped set: of all grasps, then of the better ones."""
+"""Episodes per grasp of a proof that makes a bundled set: of all grasps, then of the better ones."""
 BETTER = 0.2
 """Share of them that is tried again."""
 BATCH = 64
@@ -35,6 +34,12 @@ STARTS, USABLE = 64, 0.5
 """Starts from which a grasp is asked to be within reach, and from which share of them."""
 SEED = 10_000
 """First seed; far from those of training and evaluation, so that scores are not made on their starts."""
+
+
+def tasks_of(obj: AffordanceObject) -> list[str]:
+    """Ids of the registered tasks that use an object, sorted; its grasps are executed in the first."""
+    ids = [env_id for env_id in task_ids() if obj.name in {arm.object for arm in find_task(env_id).ARMS.values()}]
+    return ids if ids and load_object(obj.name) is obj else []
 
 
 @dataclass(frozen=True)
@@ -134,14 +139,14 @@ def ranked(candidates: GraspCandidates, proof: TaskRanking) -> GraspCandidates:
     return replace(candidates, score=proof.score).select(order)
 
 
-def usable_in_task(name: str) -> Callable[[GraspCandidates], Bool[Tensor, " c"]] | None:
+def usable_in_task(name: str | Path) -> Callable[[GraspCandidates], Bool[Tensor, " c"]] | None:
     """A function that tells which grasps of an object its task can use at all, f_reach of the task's own.
 
     None where there is no such task, or the object stands on a table, which the search for grasps takes care of.
     """
-    if name not in TASKS or name not in OFF_TABLE:
-        return None
-    return _Usable(TASKS[name])
+    obj = load_object(name)
+    ids = tasks_of(obj)
+    return None if not ids or obj.on_table else _Usable(ids[0])
 
 
 class _Usable:
@@ -164,46 +169,55 @@ class _Usable:
         return (task.task.reachable(task.arm, pose.p, pose.q).float().mean(0) >= USABLE).cpu()
 
 
-def rank_bundled_set(name: str, phase: Callable[[str], Callable[[int, int], None]]) -> Path:
-    """Executes the shipped grasps of an object's target class in its task and stores them anew, best first.
+def rank_bundled_set(name: str | Path, phase: Callable[[str], Callable[[int, int], None]]) -> Path:
+    """Executes the bundled grasps of an object's target class in its task and stores them anew, best first.
 
     All are tried a few times, and the better ones again with other starts: their scores are those of the second round,
-    and those of the others at most as high. Grasps of other classes follow as they were. The tables of f_reach that
-    come with Dora are made to match.
+    and those of the others at most as high. Grasps of other classes follow as they were. The tables of f_reach in the
+    object's folder are made to match.
 
     Args:
-        name: an object in `TASKS`.
+        name: of an object or its folder, as for `load_object`.
         phase: gives the progress callback of a named phase.
+
+    Raises:
+        InputError: no such object, no candidates, or no task that uses the object.
     """
-    found, obj = load_candidates(name), load_object(name)
-    wanted = found.of_class(obj.classes[obj.label_index(obj.target)])
+    obj = load_object(name)
+    ids = tasks_of(obj)
+    if not ids:
+        raise InputError(f"no task uses the object {str(name)!r}, so its grasps cannot be ranked in one.")
+    found = load_candidates(name)
+    wanted = found.of_class(obj.target_class)
     tested = found.select(wanted)
-    env_id, count = TASKS[name], len(tested)
-    tested = ranked(tested, rank_in_task(env_id, tested, FIRST_TRIES * count, progress=phase(f"{name}: execute all")))
+    count, everything, better = len(tested), phase(f"{obj.name}: execute all"), f"{obj.name}: execute the better ones"
+    tested = ranked(tested, rank_in_task(ids[0], tested, FIRST_TRIES * count, progress=everything))
     few = math.ceil(BETTER * count)
     best, rest = tested.select(slice(few)), tested.select(slice(few, None))
-    again = rank_in_task(
-        env_id, best, MORE_TRIES * few, progress=phase(f"{name}: execute the better ones"), seed=2 * SEED
-    )
+    again = rank_in_task(ids[0], best, MORE_TRIES * few, progress=phase(better), seed=2 * SEED)
     best = ranked(best, again)
     tested = concatenate([best, replace(rest, score=rest.score.clamp(max=float(best.score.min())))])
     others = [found.select(~wanted)] if not wanted.all() else []
     path = bundled_path(name)
     replace(concatenate([tested, *others]), settings=found.settings).save(path)
-    bundle_feasibility_tables()
+    bundle_feasibility_tables(name)
     return path
 
 
-def bundle_feasibility_tables() -> list[Path]:
-    """Puts the tables of f_reach of all tasks' candidates beside them, and removes those of former candidates."""
-    kept = []
-    for env_id in TASKS.values():
+def bundle_feasibility_tables(name: str | Path) -> list[Path]:
+    """Puts the tables of f_reach of all tasks that use an object into its folder, and removes those of former grasps.
+
+    Raises:
+        InputError: no such object, or it has no folder.
+    """
+    folder, kept = bundled_path(name).parent, []
+    for env_id in tasks_of(load_object(name)):
         task = make_task(env_id, 1)
         table = task.arm.reach_table
         task.close()
         if table is not None:
-            kept.append(data_folder() / f"reach-{table.digest[:16]}.safetensors")
+            kept.append(folder / file_name(table.digest))
             table.save(kept[-1])
-    for old in set(data_folder().glob("reach-*.safetensors")) - set(kept):
+    for old in set(folder.glob(file_name("*"))) - set(kept):
         old.unlink()
     return kept

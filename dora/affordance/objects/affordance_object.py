@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -15,6 +17,12 @@ from dora.robot.shapes import Shape
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 """Resting orientation (wxyz) of an object that stands on a table as it was modelled."""
+Placement = Literal["table", "air", "fixture"]
+"""Where an object is before it is grasped: on a table, in the air (it is caught), or as a part of something fixed."""
+FRICTION = 0.7
+"""Nominal coefficient of friction where none is given."""
+HOME = "home"
+"""Posture of the arm before a grasp where none is given."""
 DIGEST_LENGTH = 1e-7
 """Lengths in a digest are rounded to this (m); areas and second moments to its square and fourth power."""
 
@@ -57,6 +65,10 @@ class AffordanceObject:
         support: height (m) of the origin above the table on which the object rests.
         rest: orientation (wxyz) of the object frame at rest on a horizontal table.
         digest: sha256 of the labelled surface, see `surface_digest`.
+        friction: nominal coefficient, static and dynamic.
+        placement: where it is before it is grasped.
+        start_posture: name of the robot's posture from which an arm sets out to grasp it.
+        folder: that it was read from, with its grasps and reach tables; None for an object that has none.
     """
 
     name: str
@@ -72,6 +84,20 @@ class AffordanceObject:
     support: float
     rest: tuple[float, float, float, float]
     digest: str
+    friction: float = FRICTION
+    placement: Placement = "table"
+    start_posture: str = HOME
+    folder: Path | None = None
+
+    @property
+    def on_table(self) -> bool:
+        """Whether a hand that grasps it has to keep above a table."""
+        return self.placement == "table"
+
+    @property
+    def target_class(self) -> str:
+        """Grasp class of the region that a task wants held."""
+        return self.classes[self.labels.index(self.target)]
 
     def label_index(self, label: str) -> int:
         """Index of a region.
@@ -106,6 +132,9 @@ def assemble(
     pieces: Sequence[Piece],
     solid: trimesh.Trimesh | None = None,
     rest: tuple[float, float, float, float] = UPRIGHT,
+    friction: float = FRICTION,
+    placement: Placement = "table",
+    start_posture: str = HOME,
 ) -> AffordanceObject:
     """An object from parts in any one frame; moves the origin to the centre of mass.
 
@@ -119,6 +148,9 @@ def assemble(
         pieces: collision shapes.
         solid: `mesh` without cavities, if it has one.
         rest: orientation (wxyz) at rest on a table.
+        friction: nominal coefficient.
+        placement: where it is before it is grasped.
+        start_posture: name of the arm's posture before a grasp.
     """
     mass, center, inertia = mass_properties(weights)
     mesh = moved(mesh, -center)
@@ -136,6 +168,9 @@ def assemble(
         support=support_height(mesh, rest),
         rest=rest,
         digest=surface_digest(mesh, face_labels, tuple(regions)),
+        friction=friction,
+        placement=placement,
+        start_posture=start_posture,
     )
 
 

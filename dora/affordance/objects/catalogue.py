@@ -1,34 +1,80 @@
-"""The objects of the tasks, by name."""
+"""The objects that can be named: folders of `objects/` and of DORA_OBJECTS, and how one is loaded."""
 
 from __future__ import annotations
 
+import difflib
 import functools
+import os
+from pathlib import Path
 
+import dora
 from dora.affordance.objects.affordance_object import AffordanceObject, Piece
-from dora.affordance.objects.models import cube, hammer, jug, microwave
+from dora.affordance.objects.folder_reading import OBJECT_FILE, read_object_folder
+from dora.affordance.objects.importing import import_object
 from dora.errors import InputError
 
 __all__ = ["AffordanceObject", "Piece", "available_objects", "load_object"]
 
-BUILDERS = {"cube": cube.build, "jug": jug.build, "hammer": hammer.build, "microwave": microwave.build}
-"""What makes each object."""
+SEARCH_VARIABLE = "DORA_OBJECTS"
+"""Environment variable with further folders of objects, separated as in PATH."""
+MESHES = (".glb", ".obj", ".off", ".ply", ".stl")
+"""Endings of files that count as objects where they lie beside the folders of objects."""
+
+
+def own_objects() -> Path:
+    """The folder of the objects that come with Dora: the wheel's, or the repository's."""
+    package = Path(dora.__file__).parent
+    return package / "_objects" if (package / "_objects").is_dir() else package.parent / "objects"
+
+
+def object_places() -> dict[str, Path]:
+    """Folder, or mesh file, of every object that can be named; of two with one name the later place counts."""
+    found: dict[str, Path] = {}
+    extra = [Path(part) for part in os.environ.get(SEARCH_VARIABLE, "").split(os.pathsep) if part]
+    for place in filter(Path.is_dir, [own_objects(), *extra]):
+        for path in sorted(place.iterdir()):
+            if path.suffix.lower() in MESHES:
+                found[path.stem] = path
+            elif (path / OBJECT_FILE).is_file():
+                found[path.name] = path
+    return found
 
 
 def available_objects() -> tuple[str, ...]:
-    """Names that `load_object` knows."""
-    return tuple(BUILDERS)
+    """Names that `load_object` knows, sorted."""
+    return tuple(sorted(object_places()))
+
+
+def load_object(name: str | Path) -> AffordanceObject:
+    """An object, read once per process.
+
+    Args:
+        name: one of `available_objects`, the folder of an object.toml, or a mesh file, which is taken to be in metres
+            and without further labels (`import_object` asks for more).
+
+    Raises:
+        InputError: there is no such object, or its files do not fit.
+    """
+    places = object_places()
+    path = places.get(str(name), Path(name))
+    if os.path.isdir(path):
+        return _read_folder(path.resolve())
+    if os.path.isfile(path):
+        return _read_mesh(path.resolve(), path.stat().st_mtime_ns)
+    near = difflib.get_close_matches(str(name), places, 1)
+    hint = f"did you mean {near[0]}? " if near else ""
+    raise InputError(
+        f"there is no object {str(name)!r}; {hint}choose one of: {', '.join(sorted(places))}, "
+        "or give the path of a folder or mesh."
+    )
 
 
 @functools.cache
-def load_object(name: str) -> AffordanceObject:
-    """An object of ours; built once per process, in well under a second.
+def _read_folder(folder: Path) -> AffordanceObject:
+    return read_object_folder(folder)
 
-    Args:
-        name: one of `available_objects`; "microwave" is the handle of a microwave's door.
 
-    Raises:
-        InputError: there is no such object.
-    """
-    if name not in BUILDERS:
-        raise InputError(f"There is no object {name!r}; choose one of: {', '.join(BUILDERS)}.")
-    return BUILDERS[name]()
+@functools.cache
+def _read_mesh(path: Path, time: int) -> AffordanceObject:
+    """The object of a mesh file as it was at a time of its last change."""
+    return import_object(path)

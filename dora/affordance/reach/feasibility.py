@@ -102,6 +102,7 @@ class Reach:
             raise InputError(f"{robot.name!r} has no posture {start!r}; choose from {', '.join(robot.postures)}.")
         self.robot, self.settings = robot, settings or ReachSettings()
         self.digest = "" if obj is None else obj.digest
+        self.folder = None if obj is None else obj.folder
         self.base = base
         self.pieces: tuple[Shape | trimesh.Trimesh, ...] = () if obj is None else tuple(p.shape for p in obj.pieces)
         self.kinematics = InverseKinematics(robot, robot.postures[start].arm)

@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from dora.affordance.bundled_sets import data_folder
 from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.objects.decomposition import cache_folder
 from dora.affordance.reach.approach_paths import OK
@@ -123,7 +122,7 @@ class ReachTable:
         cache: Path | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> ReachTable:
-        """Runs the filter at every node, or reads the table if it comes with Dora or is in the folder `cache`.
+        """Runs the filter at every node, or reads the table if it is in the object's folder or in the folder `cache`.
 
         A run takes about half a millisecond per node and candidate, a reading a few milliseconds.
 
@@ -140,9 +139,9 @@ class ReachTable:
             InputError: Pinocchio or Coal is needed and not installed.
         """
         digest = table_digest(reach, candidates, grid, height, rest)
-        name = f"reach-{digest[:16]}.safetensors"
-        path = (cache or cache_folder()) / name
-        for known in (data_folder() / name, path):
+        path = (cache or cache_folder()) / file_name(digest)
+        bundled = [] if reach.folder is None else [reach.folder / file_name(digest)]
+        for known in (*bundled, path):
             if known.is_file():
                 return cls.load(known, digest, grid, height, rest)
         nodes, count = grid.nodes(), max(1, CHUNK // len(candidates))
@@ -198,6 +197,11 @@ class ReachTable:
     def to(self, device: torch.device | str) -> ReachTable:
         """The same table on another device."""
         return ReachTable(self.grid, self.rest, self.height, self.reason.to(device), self.digest)
+
+
+def file_name(digest: str) -> str:
+    """Name of the file of the table with a digest."""
+    return f"reach-{digest[:16]}.safetensors"
 
 
 def table_digest(

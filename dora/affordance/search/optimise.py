@@ -31,8 +31,6 @@ __all__ = ["Settings", "optimise"]
 
 Progress = Callable[[int, int], None]
 """Called with the candidate-iterations done and their total."""
-OFF_TABLE = ("hammer", "microwave")
-"""Objects that their tasks do not take from a table: one is caught in the air, the other is a door's handle."""
 OPENINGS = (0.25, 0.5, 0.75, 1.0)
 """Shares of the protocol's opening that are tried."""
 OPENING_DEPTH = 1e-3
@@ -79,7 +77,7 @@ def optimise(
         raise InputError(f"the search makes at least 1 candidate, not {num}.")
     place = str(torch.device(device))
     hand, field = hand_of(robot, place), field_of(obj, region, place)
-    on_table = obj.name not in OFF_TABLE if settings.table is None else settings.table
+    on_table = obj.on_table if settings.table is None else settings.table
     kind = CompiledEnergy if hand.device.type == "cpu" else GraspEnergy
     energy = kind(hand, field, settings.weights, table_of(obj) if on_table else None)
     search = Search(energy, initial_of(obj, robot, region, settings.spread, place), settings)

@@ -48,7 +48,7 @@ class Settings:
         rotation: largest rotation of the wrist in a step (rad).
         joint: largest step of a joint (rad).
         batch: candidates searched at once; more does not fit a core's cache.
-        table: keep the hand above the table on which the object rests; None: unless it is one of `OFF_TABLE`.
+        table: keep the hand above the table on which the object rests; None: if it is on one before it is grasped.
         spread: of the initial poses.
     """
 

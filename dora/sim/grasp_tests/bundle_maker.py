@@ -19,7 +19,7 @@ from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.approach_directions import free_approaches
 from dora.affordance.reach.feasibility import Reach
 from dora.affordance.reach.feasibility_table import Grid, poses
-from dora.affordance.search.optimise import OFF_TABLE, Settings, optimise
+from dora.affordance.search.optimise import Settings, optimise
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.progress import PhaseProgress
@@ -34,11 +34,9 @@ MOST_ROUNDS = 20
 POOL = 240
 """Grasps of the target region that are ranked."""
 KEPT = 96
-"""The best of them that are shipped."""
+"""The best of them that are bundled."""
 FEWEST = 64
-"""Grasps of the target region below which nothing is shipped."""
-STARTS = {"jug": "above"}
-"""Posture from which the arm sets out, where it is not "home"."""
+"""Grasps of the target region below which nothing is bundled."""
 PLACES = Grid((0.55, 0.0), (0.08, 0.08), spacing=0.08, yaws=12)
 """Where objects on a table may stand: a grasp has to be feasible somewhere."""
 FEASIBLE = 0.03
@@ -46,7 +44,7 @@ FEASIBLE = 0.03
 OTHERS = 64
 """Candidates searched for each other region."""
 OTHERS_KEPT = 32
-"""The best of them that are shipped."""
+"""The best of them that are bundled."""
 
 
 Usable = Callable[[GraspCandidates], Bool[Tensor, " c"]]
@@ -54,34 +52,31 @@ Usable = Callable[[GraspCandidates], Bool[Tensor, " c"]]
 
 
 def make_bundle(name: str, seed: int, phases: PhaseProgress, usable: Usable | None = None) -> Path:
-    """Make and write the shipped set of an object; returns its file.
+    """Make and write the bundled set of an object; returns its file.
 
     Args:
-        name: one of our objects.
+        name: of an object or its folder, as for `load_object`.
         seed: of all random draws.
         phases: where progress is shown.
         usable: what the object's task can use; the best grasps of the target region are chosen among those, and some
             of the others follow.
 
     Raises:
-        InputError: unknown object, or too few valid grasps.
+        InputError: unknown object, one without a folder, or too few valid grasps.
     """
-    maker = SetMaker(load_object(name), load_robot(ROBOT), phases, usable)
     path = bundled_path(name)
-    path.parent.mkdir(exist_ok=True)
-    maker.make(seed).save(path)
+    SetMaker(load_object(name), load_robot(ROBOT), phases, usable).make(seed).save(path)
     return path
 
 
 class SetMaker:
-    """Makes the shipped set of one object for one robot; `usable` as of `ship`."""
+    """Makes the bundled set of one object for one robot; `usable` as of `make_bundle`."""
 
     def __init__(
         self, obj: AffordanceObject, robot: RobotDescription, phases: PhaseProgress, usable: Usable | None = None
     ) -> None:
         self.obj, self.robot, self.phases, self.usable = obj, robot, phases, usable
-        self.reach = Reach(robot, obj, start=STARTS.get(obj.name, "home"))
-        self.on_table = obj.name not in OFF_TABLE
+        self.reach = Reach(robot, obj, start=obj.start_posture)
 
     def make(self, seed: int) -> GraspCandidates:
         """The best grasps of the target region, then those of the others; InputError if there are too few."""
@@ -119,7 +114,7 @@ class SetMaker:
         if not good.any():
             return None
         found, free = free_approaches(found.select(good), self.reach)
-        if self.on_table:
+        if self.obj.on_table:
             if not free.any():
                 return None
             found = found.select(free)
@@ -134,7 +129,7 @@ class SetMaker:
     def ranked(self, candidates: GraspCandidates) -> GraspCandidates:
         """With scores, best first: by lifts from the table, or by holds in the air of what is not on one."""
         report = self.phase(f"rank {candidates.grasp_class[0]}")
-        if self.on_table:
+        if self.obj.on_table:
             score = rank(candidates, self.obj, self.robot, progress=report)
         else:
             score = holds(candidates, self.obj, self.robot, report)

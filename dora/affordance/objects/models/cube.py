@@ -8,6 +8,7 @@ from dora.robot.shapes import Shape
 
 EDGE = 0.06
 MASS = 0.12
+FRICTION = 0.9
 
 
 def build() -> AffordanceObject:
@@ -24,4 +25,5 @@ def build() -> AffordanceObject:
         target="body",
         weights=[(mesh, MASS)],
         pieces=[Piece("body", box)],
+        friction=FRICTION,
     )

@@ -27,6 +27,7 @@ from dora.affordance.objects.solids import (
 )
 
 HEAD_MASS, HANDLE_MASS = 0.20, 0.08
+FRICTION = 0.9
 HEAD_Z = 0.262
 """Height of the striking axis."""
 SHOULDER_Z = 0.238
@@ -92,6 +93,8 @@ def build() -> AffordanceObject:
             ),
         ],
         rest=ON_SIDE,
+        friction=FRICTION,
+        placement="air",
     )
 
 

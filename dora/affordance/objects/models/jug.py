@@ -90,6 +90,7 @@ def build() -> AffordanceObject:
             *(Piece("handle", capsule) for capsule in capsules),
         ],
         solid=unite([filled, handle])[0],
+        start_posture="above",
     )
 
 

@@ -53,6 +53,7 @@ def build() -> AffordanceObject:
             Piece("door", Shape("box", (-x, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (x, y, z))),
         ],
         rest=ON_BACK,
+        placement="fixture",
     )
 
 

@@ -1,0 +1,254 @@
+"""Reading an object's folder: `object.toml` and its meshes become an `AffordanceObject`, or are refused."""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+
+from dora.affordance.objects.affordance_object import (
+    FRICTION,
+    HOME,
+    UPRIGHT,
+    AffordanceObject,
+    Piece,
+    Placement,
+    support_height,
+    surface_digest,
+)
+from dora.affordance.objects.importing import LARGEST, SMALLEST
+from dora.affordance.objects.mesh_files import LABEL, read_ply
+from dora.errors import InputError
+from dora.robot.shapes import Shape
+
+OBJECT_FILE = "object.toml"
+FORMAT = "dora-object 1"
+"""Format and version of an object's folder."""
+MOST_BYTES = 1_000_000
+"""Size of an object.toml above which it is not read [bytes]."""
+FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*\.ply")
+"""Names of mesh files: plain, so that they lie in the folder itself."""
+SIZES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}
+"""Numbers that give the size of each primitive, see `dora.robot.shapes.Shape`."""
+UNIT = 1e-6
+"""Largest deviation of a quaternion's norm from 1."""
+SYMMETRY = 1e-9
+"""Largest difference of mirrored entries of an inertia, and of what its moments may lack, as a share of the largest."""
+KEYS = {
+    "object": (
+        ("format", "name", "mesh", "target", "mass", "inertia", "regions", "pieces"),
+        ("solid", "friction", "placement", "rest", "start_posture"),
+    ),
+    "region": (("name", "grasp_class"), ()),
+    "primitive": (("region", "shape", "position", "quaternion", "size"), ()),
+    "hull": (("region", "mesh"), ()),
+}
+"""Required and optional keys of each kind of table."""
+RESERVED = ("joints", "links")
+"""Keys kept for objects of several bodies."""
+
+Table = dict[str, Any]
+
+
+def read_object_folder(folder: Path) -> AffordanceObject:
+    """The object of a folder, with every number as it is written there (docs/objects.md has the format).
+
+    Raises:
+        InputError: a file is missing, damaged or too large, or its content does not fit; the file is named.
+    """
+    return _Reader(folder).object()
+
+
+class _Reader:
+    """Turns the tables of one object.toml into a checked object; every error names the file."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.path = folder, folder / OBJECT_FILE
+
+    def fail(self, text: str) -> InputError:
+        return InputError(f"{self.path}: {text}")
+
+    def content(self) -> Table:
+        """The tables of the file, with known keys alone."""
+        if not self.path.is_file():
+            raise InputError(f"{self.folder} has no {OBJECT_FILE}; give the folder of an object.")
+        if self.path.stat().st_size > MOST_BYTES:
+            raise self.fail(f"the file has more than {MOST_BYTES} bytes; keep meshes in files of their own.")
+        try:
+            content = tomllib.loads(self.path.read_text("utf-8"))
+        except (ValueError, RecursionError) as error:
+            raise self.fail(f"the file is not valid TOML ({error}); correct it.") from error
+        for key in RESERVED:
+            if key in content:
+                raise self.fail(f"{key!r} is reserved for articulated objects, which cannot be loaded yet; remove it.")
+        self.keys(content, "object", "the file")
+        if content["format"] != FORMAT:
+            raise self.fail(f"the format is {content['format']!r}, not {FORMAT!r}; write the folder again.")
+        if content["name"] != self.folder.name:
+            raise self.fail(
+                f"the name is {content['name']!r}, and the folder is {self.folder.name!r}; make them equal."
+            )
+        return content
+
+    def object(self) -> AffordanceObject:
+        """The whole object; InputError about the first thing that does not fit."""
+        content = self.content()
+        names, classes = self.regions(content["regions"])
+        mesh, labels = self.surface(content["mesh"], names)
+        rest = self.quaternion(content.get("rest", list(UPRIGHT)), "rest")
+        return AffordanceObject(
+            name=content["name"],
+            mesh=mesh,
+            face_labels=labels,
+            labels=names,
+            classes=classes,
+            target=self.one_of(content["target"], names, "target"),
+            solid=self.closed(content["solid"])[0] if "solid" in content else mesh,
+            mass=self.positive(content["mass"], "mass"),
+            inertia=self.inertia(content["inertia"]),
+            pieces=self.pieces(content["pieces"], names),
+            support=support_height(mesh, rest),
+            rest=rest,
+            digest=surface_digest(mesh, labels, names),
+            friction=self.positive(content.get("friction", FRICTION), "friction"),
+            placement=self.one_of(content.get("placement", "table"), get_args(Placement), "placement"),
+            start_posture=self.text(content.get("start_posture", HOME), "start_posture"),
+            folder=self.folder,
+        )
+
+    def keys(self, table: Any, kind: str, where: str) -> None:
+        """Refuses unknown and missing keys of a table."""
+        if not isinstance(table, dict):
+            raise self.fail(f"{where} must be a table.")
+        required, optional = KEYS[kind]
+        for key in table:
+            if key not in required + optional:
+                raise self.fail(f"{where} has the unknown key {key!r}; known: {', '.join(required + optional)}.")
+        for key in required:
+            if key not in table:
+                raise self.fail(f"{where} lacks the key {key!r}; add it.")
+
+    def text(self, value: Any, where: str) -> str:
+        if not isinstance(value, str) or not value:
+            raise self.fail(f"{where} must be a text that is not empty.")
+        return value
+
+    def one_of(self, value: Any, known: tuple[str, ...], where: str) -> Any:
+        if value not in known:
+            raise self.fail(f"{where} is {value!r}; choose one of: {', '.join(known)}.")
+        return value
+
+    def rows(self, value: Any, where: str) -> list[Any]:
+        if not isinstance(value, list) or not value:
+            raise self.fail(f"[[{where}]] must have at least one table.")
+        return value
+
+    def numbers(self, value: Any, length: int, where: str) -> tuple[float, ...]:
+        """Finite numbers in a list of this length."""
+        if not isinstance(value, list) or len(value) != length:
+            raise self.fail(f"{where} must be a list of {length} numbers.")
+        if not all(isinstance(each, int | float) and not isinstance(each, bool) for each in value):
+            raise self.fail(f"{where} must be numbers.")
+        if not all(abs(each) < math.inf for each in value) or any(isinstance(x, int) and abs(x) > 1e300 for x in value):
+            raise self.fail(f"{where} must be finite numbers.")
+        return tuple(float(each) for each in value)
+
+    def positive(self, value: Any, where: str) -> float:
+        (number,) = self.numbers([value], 1, where)
+        if number <= 0:
+            raise self.fail(f"{where} is {number}; it must be positive.")
+        return number
+
+    def quaternion(self, value: Any, where: str) -> tuple[float, float, float, float]:
+        """A unit quaternion (wxyz)."""
+        w, x, y, z = self.numbers(value, 4, where)
+        if not abs(math.sqrt(w * w + x * x + y * y + z * z) - 1) < UNIT:
+            raise self.fail(f"{where} must be a quaternion (w, x, y, z) of norm 1.")
+        return w, x, y, z
+
+    def inertia(self, value: Any) -> Float[np.ndarray, "3 3"]:
+        """An inertia [kg m^2] that a body can have: symmetric, no principal moment above the sum of the others."""
+        if not isinstance(value, list) or len(value) != 3:
+            raise self.fail("inertia must be a list of 3 lists of 3 numbers.")
+        found = np.array([self.numbers(row, 3, "each row of inertia") for row in value])
+        slack = SYMMETRY * np.abs(found).max()
+        if np.abs(found - found.T).max() > slack:
+            raise self.fail("inertia must be symmetric.")
+        least, middle, most = np.linalg.eigvalsh(found)
+        if not (least > 0 and least + middle >= most - slack):
+            raise self.fail("inertia belongs to no body: check that it is about the centre of mass, in kg m^2.")
+        return found
+
+    def regions(self, value: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Names of the regions and their grasp classes, in the order of the file."""
+        names, classes = [], []
+        for row in self.rows(value, "regions"):
+            self.keys(row, "region", "a region")
+            names.append(self.text(row["name"], "the name of a region"))
+            classes.append(self.text(row["grasp_class"], f"grasp_class of {row['name']!r}"))
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise self.fail(f"two regions are named {twice!r}; rename one of them.")
+        return tuple(names), tuple(classes)
+
+    def mesh(self, name: Any) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"] | None]:
+        """A mesh of the folder and the labels of its faces, if it has any."""
+        if not isinstance(name, str) or not FILE_NAME.fullmatch(name):
+            raise self.fail(f"{name!r} is no name of a mesh; name a .ply file in the folder itself.")
+        mesh, labels = read_ply(self.folder / name)
+        if np.abs(mesh.vertices).max() > LARGEST:
+            raise InputError(f"{self.folder / name} reaches farther than {LARGEST} m from its origin: use metres.")
+        return mesh, labels
+
+    def closed(self, name: Any) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"] | None]:
+        """A closed surface with outward faces."""
+        mesh, labels = self.mesh(name)
+        if not (mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0):
+            raise InputError(f"{self.folder / name} is no closed surface with outward faces: repair the mesh.")
+        return mesh, labels
+
+    def surface(self, name: Any, regions: tuple[str, ...]) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"]]:
+        """The object's surface around its origin, with a region for every face and a face for every region."""
+        mesh, labels = self.closed(name)
+        if mesh.extents.max() < SMALLEST:
+            raise InputError(f"{self.folder / name} is smaller than {SMALLEST} m: use metres.")
+        if not ((mesh.bounds[0] < 0) & (mesh.bounds[1] > 0)).all():
+            raise InputError(f"{self.folder / name} lies beside its origin: move the centre of mass there.")
+        if labels is None:
+            if len(regions) > 1:
+                raise InputError(f"{self.folder / name} has no face property {LABEL!r}: add it, or keep one region.")
+            labels = np.zeros(len(mesh.faces), np.int64)
+        if labels.min() < 0 or labels.max() >= len(regions):
+            raise InputError(f"{self.folder / name} has labels that are not in 0 to {len(regions) - 1}: correct them.")
+        bare = sorted(set(range(len(regions))) - set(labels.tolist()))
+        if bare:
+            raise self.fail(f"the region {regions[bare[0]]!r} has no face in {name}; label some, or remove it.")
+        return mesh, labels
+
+    def pieces(self, value: Any, regions: tuple[str, ...]) -> tuple[Piece, ...]:
+        """The convex collision shapes."""
+        return tuple(self.piece(row, regions, f"piece {i}") for i, row in enumerate(self.rows(value, "pieces")))
+
+    def piece(self, row: Any, regions: tuple[str, ...], where: str) -> Piece:
+        """One collision shape: a primitive, or the file of a convex hull."""
+        self.keys(row, "hull" if isinstance(row, dict) and "mesh" in row else "primitive", where)
+        region = self.one_of(row["region"], regions, f"the region of {where}")
+        if "mesh" in row:
+            hull, _ = self.mesh(row["mesh"])
+            if not hull.is_convex:
+                raise InputError(f"{self.folder / row['mesh']} is not convex: cut it into convex pieces.")
+            return Piece(region, hull)
+        kind = self.one_of(row["shape"], tuple(SIZES), f"the shape of {where}")
+        x, y, z = self.numbers(row["position"], 3, f"the position of {where}")
+        size = self.numbers(row["size"], SIZES[kind], f"the size of {where}")
+        if min(size) <= 0:
+            raise self.fail(f"the size of {where} must be positive.")
+        return Piece(
+            region, Shape(kind, (x, y, z), self.quaternion(row["quaternion"], f"the quaternion of {where}"), size)
+        )

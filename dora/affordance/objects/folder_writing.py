@@ -1,0 +1,97 @@
+"""Writing an object as a folder: `object.toml`, its surface, its filled surface, and a mesh for every convex hull."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+from dora.affordance.objects.affordance_object import AffordanceObject, Piece
+from dora.affordance.objects.folder_reading import FORMAT, OBJECT_FILE
+from dora.affordance.objects.mesh_files import write_ply
+from dora.errors import InputError
+from dora.files import write_bytes
+from dora.robot.shapes import Shape
+
+MESH, SOLID, HULL = "mesh.ply", "solid.ply", "hull-{}.ply"
+"""Names of the meshes: the surface, the same without cavities, and the hull that is the piece of that number."""
+
+
+def write_object_folder(obj: AffordanceObject, folder: Path | str) -> Path:
+    """Write an object as a folder from which `load_object` reads it with every number the same; returns object.toml.
+
+    The object gets the folder's name. Grasps and reach tables in the folder stay; meshes that are no part of the object
+    any more are removed.
+
+    Args:
+        obj: made by `assemble` or `import_object`, or loaded.
+        folder: is made if it does not exist.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    folder = Path(folder).resolve()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder {folder} ({error.strerror}): choose another one.") from error
+    write_ply(folder / MESH, obj.mesh, obj.face_labels)
+    kept = {MESH}
+    if obj.solid is not obj.mesh:
+        write_ply(folder / SOLID, obj.solid)
+        kept.add(SOLID)
+    for index, piece in enumerate(obj.pieces):
+        if not isinstance(piece.shape, Shape):
+            write_ply(folder / HULL.format(index), piece.shape)
+            kept.add(HULL.format(index))
+    write_bytes(folder / OBJECT_FILE, object_toml(obj, folder.name).encode())
+    for old in {*folder.glob(SOLID), *folder.glob(HULL.format("*"))}:
+        if old.name not in kept:
+            old.unlink()
+    return folder / OBJECT_FILE
+
+
+def object_toml(obj: AffordanceObject, name: str) -> str:
+    """Text of the object.toml of an object with this name; numbers have as many digits as give them back exactly."""
+    lines = [
+        f"format = {_text(FORMAT)}",
+        f"name = {_text(name)}",
+        f"mesh = {_text(MESH)}  # surface [m], origin at the centre of mass",
+        *([] if obj.solid is obj.mesh else [f"solid = {_text(SOLID)}  # the same without cavities"]),
+        f"target = {_text(obj.target)}  # region that a task wants held",
+        f"mass = {float(obj.mass)!r}  # [kg]",
+        "inertia = [  # about the origin [kg m^2]",
+        *(f"    {_vector(row)}," for row in obj.inertia.tolist()),
+        "]",
+        f"friction = {float(obj.friction)!r}  # nominal coefficient",
+        f"placement = {_text(obj.placement)}  # table, air or fixture",
+        f"rest = {_vector(obj.rest)}  # orientation (w, x, y, z) at rest on a table",
+        f"start_posture = {_text(obj.start_posture)}  # of the arm, before a grasp",
+    ]
+    for label, grasp_class in zip(obj.labels, obj.classes, strict=True):
+        lines += ["", "[[regions]]", f"name = {_text(label)}", f"grasp_class = {_text(grasp_class)}"]
+    for index, piece in enumerate(obj.pieces):
+        lines += ["", "[[pieces]]", f"region = {_text(piece.label)}", *_shape(piece, index)]
+    return "\n".join([*lines, ""])
+
+
+def _shape(piece: Piece, index: int) -> list[str]:
+    """Lines about the shape of a piece."""
+    if not isinstance(piece.shape, Shape):
+        return [f"mesh = {_text(HULL.format(index))}"]
+    return [
+        f"shape = {_text(piece.shape.kind)}",
+        f"position = {_vector(piece.shape.position)}",
+        f"quaternion = {_vector(piece.shape.quaternion)}",
+        f"size = {_vector(piece.shape.size)}",
+    ]
+
+
+def _vector(values: Iterable[float]) -> str:
+    """A list of numbers that are read back as they are."""
+    return f"[{', '.join(repr(float(value)) for value in values)}]"
+
+
+def _text(text: str) -> str:
+    """A TOML string: what JSON escapes, and DEL."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
