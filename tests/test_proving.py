@@ -67,7 +67,7 @@ def test_the_table_of_reachable_candidates_comes_along(env_id: str):
     table = task.arm.reach_table
     task.close()
     assert table is not None
-    assert (own_objects() / task.OBJECT / file_name(table.digest)).is_file()
+    assert (own_objects() / task.arm.spec.object / file_name(table.digest)).is_file()
     feasible = table.reason == 0
     print(f"{feasible.any(1).float().mean():.2f} of the starts, {feasible.sum(1).float().mean():.1f} candidates each")
     assert feasible.any(1).float().mean() > 0.95

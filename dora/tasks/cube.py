@@ -133,7 +133,7 @@ class CubeTask(Task):
         for i, half in enumerate((float(cube().mesh.extents[0] / 2) * scale).tolist()):
             builder = scene.scene.create_actor_builder()
             # A material of its own: without one, every shape of every environment shares SAPIEN's default.
-            material = PhysxMaterial(FRICTION, FRICTION, 0.0)
+            material = PhysxMaterial(cube().friction, cube().friction, 0.0)
             density = cube().mass / (2 * half) ** 3
             builder.add_box_collision(half_size=(half,) * 3, material=material, density=density)
             if scene.scene.can_render():
@@ -157,8 +157,6 @@ OBSERVATIONS: dict[str, Entry] = {
 """What the task observes beyond the common entries."""
 
 
-FRICTION = 0.9
-"""Friction of the cube as built [1]; every episode sets its own."""
 RED = (0.85, 0.25, 0.15, 1.0)
 """Colour of the cube, red, green, blue and opacity [1]."""
 

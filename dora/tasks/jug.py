@@ -130,7 +130,7 @@ class JugTask(Task):
     """
 
     CONFIG = JugConfig
-    ARMS: ClassVar[Mapping[str, ArmSpec]] = {"arm": ArmSpec("jug", home="above")}
+    ARMS: ClassVar[Mapping[str, ArmSpec]] = {"arm": ArmSpec("jug")}
     DRAWS = STANDING_DRAWS
     MAX_STEPS = 120
     CONTACT_POINTS = 32

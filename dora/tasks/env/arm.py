@@ -30,14 +30,19 @@ class ArmSpec:
 
     Attributes:
         object: name of the object that it handles.
-        home: name of the robot's posture at the start of an episode.
+        home: name of the robot's posture at the start of an episode; the object's `start_posture` if None.
         position, quaternion: pose of the robot's base in the world [m], wxyz.
     """
 
     object: str
-    home: str = "home"
+    home: str | None = None
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+
+def start_posture(spec: ArmSpec) -> str:
+    """Name of the robot's posture at the start of an episode."""
+    return spec.home or load_object(spec.object).start_posture
 
 
 class Arm:
@@ -70,7 +75,8 @@ class Arm:
             torch.tensor([spec.position], dtype=torch.float32, device=device),
             torch.tensor([spec.quaternion], dtype=torch.float32, device=device),
         )
-        self.home = compose(self.base, agent.posture_wrist(spec.home))
+        self.posture = agent.description.postures[start_posture(spec)]
+        self.home = compose(self.base, agent.posture_wrist(start_posture(spec)))
 
     @property
     def reach_table(self) -> ReachTable | None:
@@ -93,14 +99,12 @@ class Arm:
     def rest(self, rows: Int[Tensor, " b"]) -> None:
         """Commands the home posture in the environments `rows`, where the robot has been put into it."""
         if self.agent.commands_wrist:
-            posture = self.agent.description.postures[self.spec.home]
-            joints = torch.tensor([*posture.arm, *posture.hand], dtype=torch.float32, device=self.agent.device)
-            self.agent.wrist_controller.begin(rows, joints.expand(len(rows), -1))
+            joints = torch.tensor([*self.posture.arm, *self.posture.hand], dtype=torch.float32)
+            self.agent.wrist_controller.begin(rows, joints.to(self.agent.device).expand(len(rows), -1))
 
     def home_joints(self) -> Float[Tensor, " joints"]:
         """The home posture in the simulator's order [rad]."""
-        posture = self.agent.description.postures[self.spec.home]
-        return torch.from_numpy(self.agent.qpos_of(posture.arm, posture.hand)).to(self.agent.device)
+        return torch.from_numpy(self.agent.qpos_of(self.posture.arm, self.posture.hand)).to(self.agent.device)
 
     def choose(
         self,
@@ -176,7 +180,7 @@ def tabulated_reach(arm: Arm, grid: Grid) -> ReachTable:
         obj,
         base=(arm.spec.position, arm.spec.quaternion),
         settings=ReachSettings(controller=Controller(period=reference.dt, descent=reference.descent)),
-        start=arm.spec.home,
+        start=start_posture(arm.spec),
     )
     candidates = arm.guide.choice.candidates.to("cpu")
     return ReachTable.of(reach, candidates, grid, obj.support, obj.rest).to(arm.agent.device)

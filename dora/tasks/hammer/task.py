@@ -19,7 +19,7 @@ from dora.affordance.objects.catalogue import load_object
 from dora.geometry.poses import relative
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
 from dora.robot import RobotDescription
-from dora.tasks.env.arm import Arm, ArmSpec
+from dora.tasks.env.arm import Arm, ArmSpec, start_posture
 from dora.tasks.env.registration import register_task
 from dora.tasks.env.scene import TaskScene
 from dora.tasks.env.task import Task
@@ -48,8 +48,6 @@ CLASS = "HandleGrasp"
 """The grasp class that the task asks for."""
 UNKNOWN = 1e3
 """Motion in the hand before the window is full [m]."""
-NOMINAL_FRICTION = 0.9
-"""Friction of the hammer as built [1]; every episode sets its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,7 +184,7 @@ class HammerTask(Task):
 
     def adapted(self, candidates: GraspCandidates, arm: str, robot: RobotDescription) -> GraspCandidates:
         """The hand waits wide open, in the posture in which the arm starts."""
-        return with_waiting_hand(candidates, robot, self.ARMS[arm].home)
+        return with_waiting_hand(candidates, robot, start_posture(self.ARMS[arm]))
 
     def reachable(
         self, arm: Arm, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]
@@ -211,7 +209,7 @@ class HammerTask(Task):
             for key, p in points.items()
         }
         above = sapien.Pose([*c.release[:2], c.release[2] + 0.5])
-        actor = scene.build(name, scale, friction=NOMINAL_FRICTION, pose=above)
+        actor = scene.build(name, scale, pose=above)
         self.nail = Nail(scene.scene, c.nail, 1 / c.physics_frequency)
         self.nail.strike_with(actor, self.points["face"].cpu().numpy())
         self.history = Buffers(scene.num_envs, scene.device, history=(1 + round(c.window / c.dt), 7))
