@@ -61,6 +61,20 @@ class UrdfModel:
             tip = above[tip].parent
         return tuple(reversed(found))
 
+    @property
+    def moving_joints(self) -> tuple[str, ...]:
+        """Names of the moving joints, breadth first from the root; joints of one link in the file's order."""
+        below: dict[str, list[UrdfJoint]] = {}
+        for joint in self.joints.values():
+            below.setdefault(joint.parent, []).append(joint)
+        links, found = [self.root], []
+        for link in links:  # grows while it is read
+            for joint in below.get(link, ()):
+                links.append(joint.child)
+                if joint.moves:
+                    found.append(joint.name)
+        return tuple(found)
+
     def frame(self, link: str, tip: str) -> np.ndarray:
         """Pose (4, 4) of `tip` in `link`, which must carry it by fixed joints; ValueError if not."""
         joints = self.chain(tip)[len(self.chain(link)) :]

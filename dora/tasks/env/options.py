@@ -10,7 +10,8 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from dora.errors import InputError
 from dora.robot import available_robots
 from dora.sim.batch.rendering import can_render
-from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot, register_robot
+from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot
+from dora.sim.robots import register_robot
 from dora.tasks.mdp.guidance_parts import guidance_in_force
 from dora.tasks.mdp.randomisation import Randomisation, find_preset
 
