@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from mani_skill.agents.controllers.base_controller import BaseController, ControllerConfig
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController, PDJointPosControllerConfig
 from torch import Tensor
@@ -57,6 +57,7 @@ class WristHandController(BaseController):
         self.hand_step = torch.tensor(robot.hand.velocity, dtype=f32, device=self.device) * self.dt
         self.target: Tensor = torch.empty(0)
         self._begun = False
+        self._starting: Tensor | None = None
         self._known: tuple[Tensor, Frames] | None = None
 
     def _initialize_action_space(self) -> None:
@@ -106,11 +107,18 @@ class WristHandController(BaseController):
         self.target = self.target.index_copy(0, rows, joints)
         self._begun = True
 
+    def expect_reset(self, starting: Bool[Tensor, " n"]) -> None:
+        """Which environments the next `reset` is about; without this, it is about all of them."""
+        self._starting = starting.clone()
+
     def reset(self) -> None:
-        """Commands the measured posture, unless `begin` has just said what to command."""
+        """Commands the measured posture where an episode starts, unless `begin` has just said what to command."""
         if not self._begun:
-            self.target = self.qpos.clone()
-        self._begun = False
+            measured, starting = self.qpos.clone(), self._starting
+            if starting is not None and len(self.target) > 0:
+                measured = torch.where(starting[:, None], measured, self.target)
+            self.target = measured
+        self._begun, self._starting = False, None
 
     def expand_hand(self, hand: Float[Tensor, "n h"]) -> Float[Tensor, "n 20"]:
         """Values of the action's hand components -> values of all hand joints, followers equal to leaders."""

@@ -131,6 +131,12 @@ class DescribedRobot(BaseAgent):
 
     # ---------------------------------------------------------------- control
 
+    def reset(self, init_qpos: Tensor | None = None) -> None:
+        """As ManiSkill's; in a partial reset the wrist commands of the other environments stay as they are."""
+        super().reset(init_qpos)  # pyright: ignore[reportArgumentType]
+        if self.commands_wrist:
+            self.wrist_controller.expect_reset(self.scene._reset_mask)
+
     @property
     def commands_wrist(self) -> bool:
         """Whether the active control mode is one of `WristHandController`."""
