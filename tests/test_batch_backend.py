@@ -10,6 +10,7 @@ import mani_skill.envs  # noqa: F401
 import numpy as np
 import psutil
 import pytest
+import sapien
 import torch
 from mani_skill.utils.wrappers.record import RecordEpisode
 
@@ -120,13 +121,18 @@ def test_record_episode_writes_trajectories(env, tmp_path):
 
 
 NO_DRIVER = """
-import gymnasium as gym, mani_skill.envs, dora.sim
+import gymnasium as gym, mani_skill.envs, sapien, dora.sim
 from dora.errors import InputError
+from dora.sim.batch.rendering import NoMaterial
+material = sapien.render.RenderMaterial
 assert not dora.sim.can_render()
+gym.make("Empty-v1", sim_backend="physx_cpu", render_backend="none").close()
+assert sapien.render.RenderMaterial is material, "a question has changed SAPIEN"
 for env_id in ("PickCube-v1", "MS-HopperHop-v1", "RotateValveLevel2-v1"):
     env = gym.make(env_id, num_envs=2, sim_backend="physx_cpu_batch", obs_mode="state")
     env.reset(seed=0)
     env.step(env.action_space.sample())
+    assert sapien.render.RenderMaterial is NoMaterial
 try:
     gym.make("PickCube-v1", num_envs=2, sim_backend="physx_cpu_batch", obs_mode="rgb")
 except InputError as error:
@@ -141,6 +147,21 @@ def test_works_without_a_vulkan_driver():
     )
     assert result.returncode == 0, result.stderr
     assert "refused: obs_mode 'rgb' needs a renderer" in result.stdout
+
+
+def test_the_ground_carries_objects_in_every_environment():
+    """ManiSkill builds a plane in the first environment only, for those that share one physics scene."""
+    env = make("Empty-v1", 3, robot_uids="none").unwrapped
+    scene = env.scene
+    builder = scene.create_actor_builder()
+    builder.add_sphere_collision(radius=0.1)
+    builder.initial_pose = sapien.Pose([0.0, 0.0, 0.2])
+    ball = builder.build("ball")
+    scene._setup(enable_gpu=False)
+    for _ in range(100):
+        scene.step()
+    assert (ball.pose.p[:, 2] - 0.1).abs().max() < 0.01
+    env.close()
 
 
 def test_closing_leaks_nothing():

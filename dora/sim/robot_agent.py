@@ -79,6 +79,12 @@ class DescribedRobot(BaseAgent):
         else:
             self.robot = self._build(name, initial_pose)
         self.robot_link_names = [link.name for link in self.robot.get_links()]
+        found = tuple(joint.name for joint in self.robot.active_joints)
+        if found != self.joint_names:
+            raise InputError(
+                f"robot {self.uid!r}: {self.urdf_path} has the moving joints {', '.join(found)} but the description "
+                f"has {', '.join(self.joint_names)}; give the class a description of its own."
+            )
 
     def _build(self, name: str, initial_pose: Any, scene_idxs: list[int] | None = None) -> Articulation:
         """One articulation, in all environments or in those of `scene_idxs`."""
@@ -122,12 +128,6 @@ class DescribedRobot(BaseAgent):
         self.distals: list[Link] = [links[f.distal] for f in d.fingers.values()]
         self._tip_p, self._tip_q = (x.to(self.device) for x in self._tip_frames())
         self.finger_links: list[list[Link]] = [[links[n] for n in f.links] for f in d.fingers.values()]
-        found = tuple(joint.name for joint in self.robot.active_joints)
-        if found != self.joint_names:
-            raise InputError(
-                f"robot {self.uid!r}: {self.urdf_path} has the moving joints {', '.join(found)} but the description "
-                f"has {', '.join(self.joint_names)}; give the class a description of its own."
-            )
 
     # ---------------------------------------------------------------- control
 
