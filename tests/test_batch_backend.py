@@ -12,6 +12,7 @@ import psutil
 import pytest
 import sapien
 import torch
+from mani_skill.envs.tasks.empty_env import EmptyEnv
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 import dora.sim
@@ -151,16 +152,19 @@ def test_works_without_a_vulkan_driver():
 
 def test_the_ground_carries_objects_in_every_environment():
     """ManiSkill builds a plane in the first environment only, for those that share one physics scene."""
-    env = make("Empty-v1", 3, robot_uids="none").unwrapped
-    scene = env.scene
-    builder = scene.create_actor_builder()
-    builder.add_sphere_collision(radius=0.1)
-    builder.initial_pose = sapien.Pose([0.0, 0.0, 0.2])
-    ball = builder.build("ball")
-    scene._setup(enable_gpu=False)
-    for _ in range(100):
-        scene.step()
-    assert (ball.pose.p[:, 2] - 0.1).abs().max() < 0.01
+
+    class Ball(EmptyEnv):
+        def _load_scene(self, options: dict) -> None:
+            super()._load_scene(options)
+            builder = self.scene.create_actor_builder()
+            builder.add_sphere_collision(radius=0.1)
+            builder.initial_pose = sapien.Pose([2.0, 0.0, 0.2])
+            self.ball = builder.build("ball")
+
+    env = Ball(num_envs=3, sim_backend=dora.sim.BACKEND, render_backend="none", obs_mode="none", reward_mode="none")
+    for _ in range(20):
+        env.step(None)
+    assert (env.ball.pose.p[:, 2] - 0.1).abs().max() < 0.01
     env.close()
 
 

@@ -216,7 +216,8 @@ def test_keyframes_of_the_class_are_the_postures_in_the_simulators_order(env):
     assert set(Diana7Hit.keyframes) == set(description.postures)
     for name, posture in description.postures.items():
         angle = dict(zip(description.arm.names + description.hand.names, np.r_[posture.arm, posture.hand], strict=True))
-        np.testing.assert_allclose(Diana7Hit.keyframes[name].qpos, [angle[joint] for joint in joints], atol=1e-6)
+        qpos = np.asarray(Diana7Hit.keyframes[name].qpos, dtype=np.float64)
+        np.testing.assert_allclose(qpos, [angle[joint] for joint in joints], atol=1e-6)
 
 
 TREE = {
