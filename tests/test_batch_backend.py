@@ -156,7 +156,7 @@ def test_the_ground_carries_objects_in_every_environment():
     class Ball(EmptyEnv):
         def _load_scene(self, options: dict) -> None:
             super()._load_scene(options)
-            builder = self.scene.create_actor_builder()
+            builder: Any = self.scene.create_actor_builder()
             builder.add_sphere_collision(radius=0.1)
             builder.initial_pose = sapien.Pose([2.0, 0.0, 0.2])
             self.ball = builder.build("ball")

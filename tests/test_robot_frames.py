@@ -97,6 +97,7 @@ def test_a_robot_built_separately_in_every_environment_is_the_same():
     env = scene(Separate, "physx_cpu_batch", "diana7_hit")
     env.reset(seed=0)
     agent = env.agent
+    assert agent.robot.merged
     assert_pose(agent.world_posture_wrist("home"), (agent.wrist.pose.p, agent.wrist.pose.q), 1e-5, 1e-4)
     obs = env.step(env.action_space.sample())[0]
     assert obs.isfinite().all()
