@@ -72,6 +72,8 @@ def copied(name: str, place: Path) -> Path:
 STEPS = """
 import gymnasium as gym, torch
 import dora
+from mani_skill.agents.registration import REGISTERED_AGENTS
+assert "diana7_hit" in REGISTERED_AGENTS
 
 for backend, num_envs in (("physx_cpu", 1), ("physx_cpu_batch", 4)):
     for mode in {modes}:
@@ -268,6 +270,8 @@ def test_a_subclass_inherits_keyframes_urdf_and_controllers(registered):
     assert Mine.urdf_path == Diana7Hit.urdf_path
     assert Mine.description is Diana7Hit.description
     assert set(Mine.keyframes) == {*Diana7Hit.keyframes, "tucked"}
+    assert type("Heir", (Mine,), {"uid": "heir"}).keyframes is Mine.keyframes
+    assert type("Bare", (DescribedRobot,), {"description": Mine.description, "keyframes": {}}).keyframes == {}
     env = make("physx_cpu_batch", robot_uids="mine")
     assert env.agent.supported_control_modes == MODES
     env.agent.reset(torch.as_tensor(env.agent.keyframes["tucked"].qpos))

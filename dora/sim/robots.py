@@ -46,7 +46,6 @@ def register_robot(name: str) -> type[DescribedRobot]:
         raise InputError(f"{description.folder}: the class name {title} of the robot {name!r} is taken; rename it")
     members = {
         "__doc__": f"The robot of {description.folder}.",
-        "__module__": __name__,
         "uid": name,
         "description": description,
     }
