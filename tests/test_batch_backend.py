@@ -10,7 +10,9 @@ import mani_skill.envs  # noqa: F401
 import numpy as np
 import psutil
 import pytest
+import sapien
 import torch
+from mani_skill.envs.tasks.empty_env import EmptyEnv
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 import dora.sim
@@ -120,13 +122,18 @@ def test_record_episode_writes_trajectories(env, tmp_path):
 
 
 NO_DRIVER = """
-import gymnasium as gym, mani_skill.envs, dora.sim
+import gymnasium as gym, mani_skill.envs, sapien, dora.sim
 from dora.errors import InputError
+from dora.sim.batch.rendering import NoMaterial
+material = sapien.render.RenderMaterial
 assert not dora.sim.can_render()
+gym.make("Empty-v1", sim_backend="physx_cpu", render_backend="none").close()
+assert sapien.render.RenderMaterial is material, "a question has changed SAPIEN"
 for env_id in ("PickCube-v1", "MS-HopperHop-v1", "RotateValveLevel2-v1"):
     env = gym.make(env_id, num_envs=2, sim_backend="physx_cpu_batch", obs_mode="state")
     env.reset(seed=0)
     env.step(env.action_space.sample())
+    assert sapien.render.RenderMaterial is NoMaterial
 try:
     gym.make("PickCube-v1", num_envs=2, sim_backend="physx_cpu_batch", obs_mode="rgb")
 except InputError as error:
@@ -141,6 +148,24 @@ def test_works_without_a_vulkan_driver():
     )
     assert result.returncode == 0, result.stderr
     assert "refused: obs_mode 'rgb' needs a renderer" in result.stdout
+
+
+def test_the_ground_carries_objects_in_every_environment():
+    """ManiSkill builds a plane in the first environment only, for those that share one physics scene."""
+
+    class Ball(EmptyEnv):
+        def _load_scene(self, options: dict) -> None:
+            super()._load_scene(options)
+            builder: Any = self.scene.create_actor_builder()
+            builder.add_sphere_collision(radius=0.1)
+            builder.initial_pose = sapien.Pose([2.0, 0.0, 0.2])
+            self.ball = builder.build("ball")
+
+    env = Ball(num_envs=3, sim_backend=dora.sim.BACKEND, render_backend="none", obs_mode="none", reward_mode="none")
+    for _ in range(20):
+        env.step(None)
+    assert (env.ball.pose.p[:, 2] - 0.1).abs().max() < 0.01
+    env.close()
 
 
 def test_closing_leaks_nothing():

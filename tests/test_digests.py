@@ -79,7 +79,7 @@ def test_bundled_tables_of_feasibility_are_found(env_id: str):
     table = task.arm.reach_table
     task.close()
     assert table is not None
-    assert (own_objects() / task.OBJECT / file_name(table.digest)).is_file()
+    assert (own_objects() / task.arm.spec.object / file_name(table.digest)).is_file()
 
 
 @pytest.mark.parametrize("path", POLICIES, ids=lambda p: p.parent.name)

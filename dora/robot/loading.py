@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache
 from itertools import combinations
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,6 @@ SEARCH_VARIABLE = "DORA_ROBOTS"
 """Environment variable with further folders of robots, separated as in PATH."""
 
 Table = dict[str, Any]
-T = TypeVar("T")
 
 KEYS = {
     "robot.toml": (
@@ -105,8 +104,10 @@ class _Reader:
             wrist_link=self.link(content["wrist_link"]),
             palm_link=self.link(content["palm_link"]),
             tip_radius=self.length(content["tip_radius"], "tip_radius"),
-            fingers={name: self.finger(name, row, hand) for name, row in content["fingers"].items()},
-            postures={name: self.posture(name, row, arm, hand) for name, row in content["postures"].items()},
+            fingers={n: self.finger(n, row, hand) for n, row in self.table(content["fingers"], "fingers").items()},
+            postures={
+                n: self.posture(n, row, arm, hand) for n, row in self.table(content["postures"], "postures").items()
+            },
             shapes=shapes,
             contacts=self.contacts(content["contact"], shapes),
             ignored_pairs=self.pairs(content.get("no_collision", {}), shapes),
@@ -114,15 +115,18 @@ class _Reader:
 
     def keys(self, table: Any, kind: str, where: str) -> None:
         """Refuses unknown and missing keys of a table."""
-        if not isinstance(table, dict):
-            raise self.fail(f"{where} must be a table.")
         required, optional = KEYS[kind]
-        for key in table:
+        for key in self.table(table, where):
             if key not in required + optional:
                 raise self.fail(f"{where} has the unknown key {key!r}; known: {', '.join(required + optional)}.")
         for key in required:
             if key not in table:
                 raise self.fail(f"{where} lacks the key {key!r}; add it.")
+
+    def table(self, value: Any, where: str) -> Table:
+        if not isinstance(value, dict):
+            raise self.fail(f"{where} must be a table.")
+        return value
 
     def link(self, name: Any) -> str:
         if name not in self.model.links:
@@ -151,8 +155,8 @@ class _Reader:
             raise self.fail(f"{where} must be a positive length in metres, not {number:g}.")
         return number
 
-    def names(self, names: Sequence[T], where: str) -> tuple[T, ...]:
-        if not isinstance(names, list) or len(set(names)) != len(names):
+    def names(self, names: Any, where: str) -> tuple[str, ...]:
+        if not isinstance(names, list) or not all(isinstance(n, str) for n in names) or len(set(names)) != len(names):
             raise self.fail(f"{where} must be a list in which every name occurs once.")
         return tuple(names)
 
@@ -179,8 +183,10 @@ class _Reader:
                 raise self.fail(f"{name}.{key} must not be negative.")
         return JointGroup(names=names, **limits, **gains)
 
-    def couplings(self, rows: Sequence[Table], hand: JointGroup) -> tuple[Coupling, ...]:
+    def couplings(self, rows: Any, hand: JointGroup) -> tuple[Coupling, ...]:
         """All couplings of the hand; InputError if a joint follows twice or leads while following."""
+        if not isinstance(rows, list):
+            raise self.fail("coupling must be a list of tables: write [[coupling]].")
         found = tuple(self.coupling(row, hand) for row in rows)
         followers = [coupling.follower for coupling in found]
         for coupling in found:
@@ -223,16 +229,16 @@ class _Reader:
                 raise self.fail(f"postures.{name} puts joint {joint!r} outside its limits.")
         return Posture(**angles)
 
-    def contacts(self, groups: dict[str, Table], shapes: Iterable[str]) -> dict[str, Contact]:
+    def contacts(self, groups: Any, shapes: Iterable[str]) -> dict[str, Contact]:
         """Contact settings by link; InputError if a link with shapes has none or two."""
         found: dict[str, Contact] = {}
-        for name, table in groups.items():
+        for name, table in self.table(groups, "contact").items():
             self.keys(table, "contact group", f"contact.{name}")
             values = {key: table[key] for key in table if key != "links"}
             contact = Contact(*self.numbers(
                 [values[key] for key in KEYS["contact group"][0][1:]], 4, f"contact.{name}"
             ).tolist())  # fmt: skip
-            for link in map(self.link, table["links"]):
+            for link in map(self.link, self.names(table["links"], f"contact.{name}.links")):
                 if link in found:
                     raise self.fail(f"link {link!r} is in two contact groups; keep it in one of them.")
                 found[link] = contact
@@ -241,10 +247,10 @@ class _Reader:
             raise self.fail(f"link {missing[0]!r} has collision shapes and is in no contact group; add it.")
         return found
 
-    def pairs(self, table: Table, shapes: Iterable[str]) -> frozenset[tuple[str, str]]:
+    def pairs(self, table: Any, shapes: Iterable[str]) -> frozenset[tuple[str, str]]:
         """Link pairs of `no_collision`; links joined by one joint, or by fixed joints, are added."""
         pairs = set()
-        for link, others in table.items():
+        for link, others in self.table(table, "no_collision").items():
             for other in self.names(others, f"no_collision.{link}"):
                 if link == other:
                     raise self.fail(f"no_collision.{link} names the link itself; remove it.")

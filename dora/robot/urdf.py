@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -61,6 +61,11 @@ class UrdfModel:
             tip = above[tip].parent
         return tuple(reversed(found))
 
+    @property
+    def moving_joints(self) -> tuple[str, ...]:
+        """Names of the moving joints, breadth first from the root; joints of one link in the file's order."""
+        return tuple(j.name for j in _breadth_first(self.root, self.joints.values()) if j.moves)
+
     def frame(self, link: str, tip: str) -> np.ndarray:
         """Pose (4, 4) of `tip` in `link`, which must carry it by fixed joints; ValueError if not."""
         joints = self.chain(tip)[len(self.chain(link)) :]
@@ -93,6 +98,17 @@ def read_urdf(path: Path) -> UrdfModel:
     return UrdfModel(root, tuple(links), {joint.name: joint for joint in joints}, shapes)
 
 
+def _breadth_first(root: str, joints: Iterable[UrdfJoint]) -> list[UrdfJoint]:
+    """The joints below a link, level by level; those of one parent in the given order."""
+    below: dict[str, list[UrdfJoint]] = {}
+    for joint in joints:
+        below.setdefault(joint.parent, []).append(joint)
+    found = list(below.pop(root, ()))
+    for joint in found:  # grows while it is read
+        found += below.pop(joint.child, ())
+    return found
+
+
 def _check_tree(path: Path, links: list[str], joints: list[UrdfJoint]) -> None:
     for kind, names in (("link", links), ("joint", [joint.name for joint in joints])):
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -107,7 +123,8 @@ def _check_tree(path: Path, links: list[str], joints: list[UrdfJoint]) -> None:
             raise InputError(f"{path}: joint {joint.name!r} has its lower limit above its upper limit.")
         if not np.isfinite([joint.lower, joint.upper, joint.velocity, joint.effort]).all() and joint.moves:
             raise InputError(f"{path}: joint {joint.name!r} needs finite limits, velocity and effort.")
-    if len(set(children)) != len(children) or len(known - set(children)) != 1:
+    roots = known - set(children)
+    if len(roots) != 1 or len(children) != len(known) - 1 or len(_breadth_first(min(roots), joints)) != len(children):
         raise InputError(f"{path}: the links must form one tree with a single root.")
 
 
@@ -132,7 +149,9 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
 
 
 def _shape(collision: ElementTree.Element) -> Shape:
-    geometry = next(iter(_child(collision, "geometry")))
+    geometry = next(iter(_child(collision, "geometry")), None)
+    if geometry is None:
+        raise ValueError("a <geometry> is empty")
     if geometry.tag not in _SIZES:
         raise ValueError(f"collision geometry <{geometry.tag}> is not a box, sphere or cylinder")
     kind, size = _SIZES[geometry.tag](geometry)

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from mani_skill.agents.controllers.base_controller import BaseController, ControllerConfig
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController, PDJointPosControllerConfig
 from torch import Tensor
 
-from dora.geometry.rotations import quaternion_from_matrix
+from dora.geometry.poses import Pose, compose
+from dora.geometry.rotations import quaternion_apply, quaternion_from_matrix, quaternion_inverse
 from dora.robot.description import RobotDescription
 from dora.robot.kinematics import Frames, SerialChain
 
@@ -32,7 +33,8 @@ class WristHandController(BaseController):
     """6 wrist displacements, then hand joint targets; every action component in [-1, 1].
 
     The first three components are a translation and the next three a rotation vector of the wrist in the robot's
-    base frame, scaled by WRIST_SPEED and WRIST_SPIN per control step. They become arm joint increments by
+    base frame, scaled by WRIST_SPEED and WRIST_SPIN per control step; `to_base_frame` makes them from a displacement
+    in the world frame, and `world_wrist` says where the command stands there. They become arm joint increments by
     dq = J^T (J J^T + lambda^2 I)^-1 dx (the paper's J^+, damped), within joint and velocity limits. The rest maps
     linearly onto the joint limits of the hand; targets move no faster than the joints' velocity limits.
     """
@@ -55,6 +57,7 @@ class WristHandController(BaseController):
         self.hand_step = torch.tensor(robot.hand.velocity, dtype=f32, device=self.device) * self.dt
         self.target: Tensor = torch.empty(0)
         self._begun = False
+        self._starting: Tensor | None = None
         self._known: tuple[Tensor, Frames] | None = None
 
     def _initialize_action_space(self) -> None:
@@ -104,11 +107,18 @@ class WristHandController(BaseController):
         self.target = self.target.index_copy(0, rows, joints)
         self._begun = True
 
+    def expect_reset(self, starting: Bool[Tensor, " n"]) -> None:
+        """Which environments the next `reset` is about; without this, it is about all of them."""
+        self._starting = starting.clone()
+
     def reset(self) -> None:
-        """Commands the measured posture, unless `begin` has just said what to command."""
+        """Commands the measured posture where an episode starts, unless `begin` has just said what to command."""
         if not self._begun:
-            self.target = self.qpos.clone()
-        self._begun = False
+            measured, starting = self.qpos.clone(), self._starting
+            if starting is not None and len(self.target) > 0:
+                measured = torch.where(starting[:, None], measured, self.target)
+            self.target = measured
+        self._begun, self._starting = False, None
 
     def expand_hand(self, hand: Float[Tensor, "n h"]) -> Float[Tensor, "n 20"]:
         """Values of the action's hand components -> values of all hand joints, followers equal to leaders."""
@@ -118,6 +128,27 @@ class WristHandController(BaseController):
         """The commanded wrist pose in the robot's base frame."""
         tip = self._frames().tip
         return tip[:, :3, 3], quaternion_from_matrix(tip[:, :3, :3])
+
+    def world_wrist(self) -> Pose:
+        """The commanded wrist pose in the world frame: (n, 3) [m], (n, 4) wxyz.
+
+        The base pose is read at each call (0.01 ms of a control step of 1 ms and more), so that a base that a task
+        has just moved counts at once.
+        """
+        base = self.articulation.pose
+        return compose((base.p, base.q), self.wrist())
+
+    def to_base_frame(self, step: Float[Tensor, "n 6"]) -> Float[Tensor, "n 6"]:
+        """A displacement in the world frame, turned into the base frame of the action.
+
+        Both halves are rotated by the inverse of the base's orientation, which keeps their lengths. So a step in
+        units of a full action ([-1, 1], see `wrist_limits`) may be given as well as one in m and rad.
+
+        Args:
+            step: translation of the wrist [m], then rotation vector [rad], both in the world frame.
+        """
+        back = quaternion_inverse(self.articulation.pose.q)
+        return torch.cat([quaternion_apply(back, step[:, :3]), quaternion_apply(back, step[:, 3:])], -1)
 
     def _frames(self) -> Frames:
         """Forward kinematics of the commanded arm, once per command."""

@@ -1,4 +1,4 @@
-"""ManiSkill robots made from robot descriptions: one agent class per folder in `robots/`."""
+"""The ManiSkill agent that is made from a robot description; `dora.sim.robots` makes one class per folder."""
 
 from typing import Any, ClassVar
 
@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Float
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosControllerConfig
-from mani_skill.agents.registration import REGISTERED_AGENTS, register_agent
-from mani_skill.utils.structs import Link
+from mani_skill.utils.structs import Articulation, Link
 from sapien.physx import PhysxMaterial
 from torch import Tensor
 
 from dora.errors import InputError
+from dora.geometry.poses import Pose, compose
 from dora.geometry.rotations import quaternion_apply, quaternion_from_matrix, quaternion_multiply
-from dora.robot import RobotDescription, available_robots, load_robot
+from dora.robot import RobotDescription
 from dora.robot.kinematics import SerialChain
 from dora.sim.controllers import CoupledJointPosConfig, WristHandConfig, WristHandController
 
@@ -28,17 +28,70 @@ JOINT_DELTA = 0.1
 
 
 class DescribedRobot(BaseAgent):
-    """A ManiSkill agent whose joints, gains, collision shapes and postures come from a `RobotDescription`."""
+    """A ManiSkill agent whose joints, gains, collision shapes and postures come from a `RobotDescription`.
+
+    A class with a `description` of its own gets `urdf_path`, `keyframes` and the joint order from it; subclasses
+    inherit them and may replace them:
+
+        @register_agent()
+        class Mine(Diana7Hit):
+            uid = "mine"
+            keyframes = {**Diana7Hit.keyframes, "tucked": Keyframe(pose=sapien.Pose(), qpos=...)}
+
+    Joint vectors "in the simulator's order" are those of ManiSkill (`robot.get_qpos()`, `Keyframe.qpos`); actions of
+    the joint modes and vectors of the description have the arm's joints first, then the hand's.
+    """
 
     description: ClassVar[RobotDescription]
+    joint_names: ClassVar[tuple[str, ...]]
+    """Moving joints in the simulator's order: breadth first from the root, as PhysX sorts the links."""
+    arm_index: ClassVar[list[int]]
+    """Places of the arm's joints in the simulator's order."""
+    hand_index: ClassVar[list[int]]
+    """Places of the hand's joints in the simulator's order."""
     fix_root_link = True
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "description" not in vars(cls):
+            return
+        d = cls.description
+        cls.joint_names = d.model.moving_joints
+        cls.arm_index, cls.hand_index = ([cls.joint_names.index(n) for n in group.names] for group in (d.arm, d.hand))
+        if "urdf_path" not in vars(cls):
+            cls.urdf_path = str(d.urdf)
+        if "keyframes" not in vars(cls):
+            cls.keyframes = {
+                name: Keyframe(pose=sapien.Pose(), qpos=cls.qpos_of(p.arm, p.hand)) for name, p in d.postures.items()
+            }
+
+    # ---------------------------------------------------------------- building
 
     def _load_articulation(self, initial_pose: Any = None) -> None:
         """Builds the articulation: primitives and materials of the description instead of the URDF's collisions."""
+        name = self.uid if self._agent_idx is None else f"{self.uid}-agent-{self._agent_idx}"
+        if self.build_separate:
+            parts = [self._build(f"{name}-{i}", initial_pose, [i]) for i in range(self.scene.num_envs)]
+            for part in parts:
+                self.scene.remove_from_state_dict_registry(part)
+            self.robot = Articulation.merge(parts, name=name, merge_links=True)
+            self.scene.add_to_state_dict_registry(self.robot)
+        else:
+            self.robot = self._build(name, initial_pose)
+        self.robot_link_names = [link.name for link in self.robot.get_links()]
+        found = tuple(joint.name for joint in self.robot.active_joints)
+        if found != self.joint_names:
+            raise InputError(
+                f"robot {self.uid!r}: {self.urdf_path} has the moving joints {', '.join(found)} but the description "
+                f"has {', '.join(self.joint_names)}; give the class a description of its own."
+            )
+
+    def _build(self, name: str, initial_pose: Any, scene_idxs: list[int] | None = None) -> Articulation:
+        """One articulation, in all environments or in those of `scene_idxs`."""
         loader = self.scene.create_urdf_loader()
-        loader.name = self.uid if self._agent_idx is None else f"{self.uid}-agent-{self._agent_idx}"
+        loader.name = name
         loader.fix_root_link = self.fix_root_link
-        builder = loader.parse(str(self.description.urdf))["articulation_builders"][0]
+        builder = loader.parse(str(self.urdf_path))["articulation_builders"][0]
         # The tips are frames, not bodies: as links they would cost PhysX 6 % of a step.
         frames = {f.tip for f in self.description.fingers.values()}
         builder.link_builders = [link for link in builder.link_builders if link.name not in frames]
@@ -50,8 +103,8 @@ class DescribedRobot(BaseAgent):
             self._add_shapes(link)
             link.collision_groups[2] |= bits.get(link.name, 0)
         builder.initial_pose = initial_pose if initial_pose is not None else sapien.Pose()
-        self.robot = builder.build()
-        self.robot_link_names = [link.name for link in self.robot.get_links()]
+        builder.set_scene_idxs(scene_idxs)
+        return builder.build()
 
     def _add_shapes(self, link: Any) -> None:
         contact = self.description.contacts.get(link.name)
@@ -75,12 +128,14 @@ class DescribedRobot(BaseAgent):
         self.distals: list[Link] = [links[f.distal] for f in d.fingers.values()]
         self._tip_p, self._tip_q = (x.to(self.device) for x in self._tip_frames())
         self.finger_links: list[list[Link]] = [[links[n] for n in f.links] for f in d.fingers.values()]
-        joints = self.robot.active_joints_map
-        self.hand_index = [int(joints[n].active_index[0]) for n in d.hand.names]
-        self.arm_index = [int(joints[n].active_index[0]) for n in d.arm.names]
-        self.keyframes = {
-            name: Keyframe(pose=sapien.Pose(), qpos=self.qpos_of(p.arm, p.hand)) for name, p in d.postures.items()
-        }
+
+    # ---------------------------------------------------------------- control
+
+    def reset(self, init_qpos: Tensor | None = None) -> None:
+        """As ManiSkill's; in a partial reset the wrist commands of the other environments stay as they are."""
+        super().reset(init_qpos)  # pyright: ignore[reportArgumentType]
+        if self.commands_wrist:
+            self.wrist_controller.expect_reset(self.scene._reset_mask)
 
     @property
     def commands_wrist(self) -> bool:
@@ -111,11 +166,34 @@ class DescribedRobot(BaseAgent):
         shift = quaternion_apply(distal_q, self._tip_p.expand_as(distal_p))
         return distal_p + shift, quaternion_multiply(distal_q, self._tip_q.expand_as(distal_q))
 
-    def qpos_of(self, arm: np.ndarray, hand: np.ndarray) -> np.ndarray:
-        """Joint vectors (..., n_arm), (..., n_hand) -> the simulator's order (..., n_arm + n_hand) [rad]."""
-        out = np.zeros((*arm.shape[:-1], len(self.arm_index) + len(self.hand_index)), np.float32)
-        out[..., self.arm_index], out[..., self.hand_index] = arm, hand
+    @classmethod
+    def qpos_of(cls, arm: np.ndarray, hand: np.ndarray) -> np.ndarray:
+        """Joint vectors (..., n_arm), (..., n_hand) -> the simulator's order (..., n_joints) [rad]."""
+        out = np.zeros((*arm.shape[:-1], len(cls.joint_names)), np.float32)
+        out[..., cls.arm_index], out[..., cls.hand_index] = arm, hand
         return out
+
+    def joint_action(self, qpos: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch a"]:
+        """The action of the present control mode that asks for joint angles given in the simulator's order [rad].
+
+        Raises:
+            InputError: if the control mode takes no joint targets.
+        """
+        _, absolute, _ = CONTROL_MODES
+        if self.control_mode not in (absolute, absolute + COUPLED):
+            raise InputError(f"the control mode {self.control_mode!r} takes no joint targets: use {absolute!r}")
+        hand = qpos[..., self.hand_index]
+        hand = self.description.reduce_hand(hand) if self.control_mode.endswith(COUPLED) else hand
+        return torch.cat([qpos[..., self.arm_index], hand], -1)
+
+    def base_pose(self) -> Pose:
+        """Pose of the robot's base in the world, (n, 3) [m] and (n, 4) wxyz, read from the simulator."""
+        pose = self.robot.pose
+        return pose.p, pose.q
+
+    def world_posture_wrist(self, name: str) -> Pose:
+        """Wrist poses (n, 3) [m], (n, 4) wxyz in the world frame, in a named posture and with the present base."""
+        return compose(self.base_pose(), self.posture_wrist(name))
 
     def posture_wrist(self, name: str) -> tuple[Tensor, Tensor]:
         """Wrist pose (1, 3) [m], (1, 4) wxyz in the robot's base frame, in a named posture."""
@@ -142,31 +220,3 @@ class DescribedRobot(BaseAgent):
             absolute_mode + COUPLED: CoupledJointPosConfig(names, robot=d, **absolute),
             delta_mode + COUPLED: CoupledJointPosConfig(names, robot=d, **delta),
         }
-
-
-def register_robot(name: str) -> type[DescribedRobot]:
-    """The agent class of the robot `name`, registered with ManiSkill under that name.
-
-    Raises:
-        InputError: if the robot is unknown or its files do not fit together.
-    """
-    if name in REGISTERED_AGENTS:
-        cls = REGISTERED_AGENTS[name].agent_cls
-        if not issubclass(cls, DescribedRobot):
-            raise InputError(f"the robot {name!r} is ManiSkill's own and has no description in robots/; rename yours")
-        return cls
-    description = load_robot(name)
-    title = "".join(part.capitalize() for part in name.split("_"))
-    members = {
-        "uid": name,
-        "description": description,
-        "urdf_path": str(description.urdf),
-        "__doc__": f"{name}: see robots/{name}/robot.toml.",
-    }
-    return register_agent()(type(title, (DescribedRobot,), members))
-
-
-def register_robots() -> None:
-    """Registers every robot that has a folder."""
-    for name in available_robots():
-        register_robot(name)

@@ -23,7 +23,7 @@ from sapien import physx
 
 from dora.errors import InputError
 from dora.sim.batch.actions import check_action
-from dora.sim.batch.rendering import can_render
+from dora.sim.batch.rendering import can_render, replace_materials
 from dora.sim.batch.scene import BatchScene
 
 BACKEND = "physx_cpu_batch"
@@ -86,6 +86,7 @@ def _parse_backends(original: Callable) -> Callable:
         info = original("physx_cpu", render_backend or "none")
         info.sim_backend = BACKEND
         if not can_render():
+            replace_materials()
             info.render_device, info.render_backend = None, "none"
         return info
 

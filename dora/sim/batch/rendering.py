@@ -1,4 +1,4 @@
-"""Whether this machine can render, and what to do for tasks that insist on materials when it cannot."""
+"""Whether this machine can render, and stand-ins for the materials that tasks make even where nothing can."""
 
 from functools import cache
 from typing import Any
@@ -27,15 +27,20 @@ class NoMaterial:
 
 @cache
 def can_render() -> bool:
-    """Whether SAPIEN finds a Vulkan driver; asked once per process, in about half a second.
-
-    If it finds none, `sapien.render.RenderMaterial` becomes `NoMaterial` from then on.
-    """
+    """Whether SAPIEN finds a Vulkan driver; asked once per process, in about half a second. Changes nothing."""
     try:
         # The render system must come before any material: SAPIEN binds to the device of the first it meets.
         sapien.render.RenderSystem(sapien.Device("cpu"))
     except RuntimeError:
-        for module in (sapien.render, pysapien.render, urdf_loader, _mjcf_loader):
-            vars(module)["RenderMaterial"] = NoMaterial
         return False
     return True
+
+
+def replace_materials() -> None:
+    """Makes `sapien.render.RenderMaterial` a `NoMaterial`, from now on and in the whole process.
+
+    Asked for in one place only: where a scene on `physx_cpu_batch` is made without a renderer
+    (`dora.sim.batch.hooks`), because ManiSkill's tasks make materials there for visuals that are never built.
+    """
+    for module in (sapien.render, pysapien.render, urdf_loader, _mjcf_loader):
+        vars(module)["RenderMaterial"] = NoMaterial

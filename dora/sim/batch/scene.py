@@ -7,6 +7,7 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.utils.building.actor_builder import ActorBuilder
 from mani_skill.utils.structs.render_camera import RenderCamera
 
 from dora.sim.batch.system import BatchSystem
@@ -54,6 +55,13 @@ class BatchScene(ManiSkillScene):
         self.px = BatchSystem(sub_scenes)
         self.gpu_sim_enabled = True
         self.rendered_environments: Sequence[int] = range(len(sub_scenes))
+
+    def create_actor_builder(self) -> ActorBuilder:
+        """ManiSkill's builder, but planes collide in every environment.
+
+        ManiSkill leaves a plane out of all environments but the first, because on a GPU they share one physics scene.
+        """
+        return super().create_actor_builder().set_allow_overlapping_plane_collisions(True)
 
     def _setup(self, enable_gpu: bool) -> None:
         """Number all bodies, then place them as a scene on a CPU does."""

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,7 +13,6 @@ from dora.affordance.reach.approach_paths import ReachSettings
 from dora.affordance.reach.feasibility import Reach
 from dora.affordance.reach.feasibility_table import Grid, ReachTable
 from dora.geometry.poses import Pose, compose
-from dora.geometry.rotations import quaternion_apply, quaternion_inverse
 from dora.robot.motion.controller_rollout import Controller
 from dora.sim.robot_agent import DescribedRobot
 from dora.tasks.guidance.guide import Guide
@@ -70,13 +68,9 @@ class Arm:
         tables: dict[str, ReachTable],
     ):
         self.name, self.spec, self.agent, self.guide, self._grid, self._tables = name, spec, agent, guide, grid, tables
-        device = agent.device
-        self.base: Pose = (
-            torch.tensor([spec.position], dtype=torch.float32, device=device),
-            torch.tensor([spec.quaternion], dtype=torch.float32, device=device),
-        )
         self.posture = agent.description.postures[start_posture(spec)]
-        self.home = compose(self.base, agent.posture_wrist(start_posture(spec)))
+        base = (torch.tensor([x], dtype=torch.float32, device=agent.device) for x in (spec.position, spec.quaternion))
+        self.home: Pose = compose((next(base), next(base)), agent.posture_wrist(start_posture(spec)))
 
     @property
     def reach_table(self) -> ReachTable | None:
@@ -159,13 +153,9 @@ class Arm:
     def _encoded(self, target: Target) -> Float[Tensor, "n a"]:
         """A world target of the wrist and a target of the hand as an action of the wrist controller, which counts in
         the robot's base frame."""
-        controller: Any = self.agent.wrist_controller
-        commanded = controller.wrist()
-        n = len(commanded[0])
-        base = self.base[0].expand(n, -1), self.base[1].expand(n, -1)
-        step = wrist_step(target.wrist_p, target.wrist_q, *compose(base, commanded), controller.wrist_limits)
-        back = quaternion_inverse(base[1])
-        step = torch.cat([quaternion_apply(back, step[:, :3]), quaternion_apply(back, step[:, 3:])], -1)
+        controller = self.agent.wrist_controller
+        step = wrist_step(target.wrist_p, target.wrist_q, *controller.world_wrist(), limits=controller.wrist_limits)
+        step = controller.to_base_frame(step)
         return torch.cat([step, controller.hand_action(target.hand)], -1)
 
 

@@ -11,7 +11,8 @@ from dora.configs import overridden
 from dora.errors import InputError
 from dora.robot import available_robots
 from dora.sim.batch.rendering import can_render
-from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot, register_robot
+from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot
+from dora.sim.robots import register_robot
 from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import guidance_in_force
 from dora.tasks.mdp.randomisation import find_preset

@@ -1,0 +1,93 @@
+"""Every file in `examples/` runs; ManiSkill's `demo_robot` shows the robot."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dora.sim import can_render
+
+DEMO = Path(__file__).parent.parent / "examples" / "demo_robot.py"
+EXAMPLES = {
+    "demo_robot": (["--help"], "--keyframe-actions"),  # it wants a screen: more of it is tried above
+    "third_party_task": ([], "4 of 4 palms came to their cubes"),
+}
+"""Arguments of every example, and something that it prints."""
+
+
+def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """What a new Python process prints."""
+    return subprocess.run(
+        [sys.executable, *arguments], capture_output=True, text=True, timeout=300, env=os.environ | environment
+    )
+
+
+WITHOUT_SCREEN = """
+import runpy, sys
+import dora, dora.sim
+import mani_skill.render.utils
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils import sapien_utils
+
+FRAMES, DRIVER = 8, {driver}
+
+class Window:
+    # The only stand-in where there is a driver: a viewer without a window, which ends the programme after some frames.
+    frames, paused, env = 0, False, None
+
+    def render(self):
+        self.frames += 1
+        if self.frames < FRAMES:
+            return
+        print("steps", int(self.env.elapsed_steps[0]), "moving", float(self.env.agent.robot.qvel.abs().max()) > 0)
+        if DRIVER:
+            picture = self.env.render_rgb_array()
+            print("picture", tuple(picture.shape), "of something", float(picture.float().std()) > 5)
+        sys.exit(0)
+
+    def close(self):
+        pass
+
+def show(env):
+    env._viewer.env = env
+
+sapien_utils.create_viewer = lambda config: Window()
+BaseEnv._setup_viewer = show
+if not DRIVER:  # what ManiSkill would find out by an error, and what it makes only where it can render
+    mani_skill.render.utils.can_render = lambda device: False
+    BaseEnv._viewer_camera_config = None
+"""
+STOCK = "runpy.run_module('mani_skill.examples.demo_robot', run_name='__main__')"
+OURS = f"dora.sim.can_render = lambda: True; runpy.run_path({str(DEMO)!r}, run_name='__main__')"
+
+
+@pytest.mark.parametrize("way", [STOCK, OURS], ids=["ManiSkill's module", "our example"])
+def test_maniskills_demo_shows_the_robot(way):
+    """All of `demo_robot` runs but its window, which needs a screen, and without a Vulkan driver its pictures."""
+    code = WITHOUT_SCREEN.format(driver=can_render()) + way
+    result = run("-c", code, "-r", "diana7_hit", "-k", "home", "--random-actions")
+    assert result.returncode == 0, result.stderr
+    assert "Selected robot diana7_hit. Control mode: pd_joint_pos" in result.stdout
+    assert "Viewing keyframe home" in result.stdout
+    assert "steps 6 moving True" in result.stdout  # two frames are drawn before the first step
+    assert can_render() == ("of something True" in result.stdout)
+
+
+def test_every_example_is_run():
+    assert {path.stem for path in DEMO.parent.glob("*.py")} == set(EXAMPLES)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_an_example_runs(name):
+    arguments, printed = EXAMPLES[name]
+    result = run(str(DEMO.parent / f"{name}.py"), *arguments)
+    assert result.returncode == 0, result.stderr
+    assert printed in result.stdout
+
+
+def test_without_a_driver_the_demo_says_so():
+    result = run(str(DEMO), VK_ICD_FILENAMES="/dev/null", VK_DRIVER_FILES="/dev/null")
+    assert result.returncode == 2
+    assert result.stderr.strip().splitlines()[-1].endswith("see docs/rendering.md")
