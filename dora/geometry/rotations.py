@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 SMALL_ANGLE = 1e-4
-"""Below this angle (rad) series replace quotients; their relative error is below 1e-16."""
+"""Below this angle [rad] series replace quotients; their relative error is below 1e-16."""
 
 
 def quaternion_multiply(a: Float[Tensor, "*#batch 4"], b: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*out 4"]:
@@ -114,7 +114,7 @@ def rotation_angle(a: Float[Tensor, "*#batch 4"], b: Float[Tensor, "*#batch 4"])
 
 
 def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Quaternion of URDF's fixed-axis angles (rad): about x, then y, then z of the parent frame."""
+    """Quaternion of URDF's fixed-axis angles [rad]: about x, then y, then z of the parent frame."""
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a / 2), math.sin(a / 2)) for a in (roll, pitch, yaw))
     return (
         cr * cp * cy + sr * sp * sy,
@@ -125,6 +125,6 @@ def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, f
 
 
 def rpy_from_z_axis(direction: Sequence[int | float]) -> tuple[float, float, float]:
-    """Fixed-axis angles (rad) with yaw after pitch that turn +z into `direction` (any length > 0)."""
+    """Fixed-axis angles [rad] with yaw after pitch that turn +z into `direction` (any length > 0)."""
     x, y, z = direction
     return 0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x) if x or y else 0.0

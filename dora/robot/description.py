@@ -68,7 +68,7 @@ class Finger:
 
 @dataclass(frozen=True)
 class Coupling:
-    """Commanded target of hand joint `follower` = `multiplier` * target of `leader` + `offset` (rad).
+    """Commanded target of hand joint `follower` = `multiplier` * target of `leader` + `offset` [rad].
 
     Joints are indices into the hand group.
     """
@@ -89,7 +89,7 @@ class Posture:
 
 @dataclass(frozen=True)
 class Contact:
-    """Contact settings of a link: friction and restitution (unitless), PhysX offsets (m)."""
+    """Contact settings of a link: friction and restitution (unitless), PhysX offsets [m]."""
 
     friction: float
     restitution: float

@@ -84,7 +84,7 @@ class SerialChain:
         return cls(description.model.chain(tip or description.wrist_link), dtype, device)
 
     def forward(self, q: Float[Tensor, "n dof"]) -> Frames:
-        """Frames at joint angles `q` (rad)."""
+        """Frames at joint angles `q` [rad]."""
         angle = q[..., None, None]
         local = torch.addcmul(self._constant, self._cosine, angle.cos()).addcmul(self._sine, angle.sin())
         pose, *rest = local.unbind(1)
@@ -95,7 +95,7 @@ class SerialChain:
         return Frames(torch.stack(frames, 1), pose @ self._tip)
 
     def tip_pose(self, q: Float[Tensor, "n dof"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-        """Position (m) and rotation matrix of the tip in the base frame."""
+        """Position [m] and rotation matrix of the tip in the base frame."""
         tip = self.forward(q).tip
         return tip[:, :3, 3], tip[:, :3, :3]
 
@@ -119,18 +119,18 @@ class SerialChain:
         rest_gain: float = 0.1,
         frames: Frames | None = None,
     ) -> Float[Tensor, "n dof"]:
-        """Change of joint angles (rad) that moves the tip by a small displacement.
+        """Change of joint angles [rad] that moves the tip by a small displacement.
 
         dq = r + J^T (J J^T + lambda^2 I)^-1 (twist - J r), r = rest_gain (rest - q): damped least squares
         with a pull towards `rest` in the null space. Defined at every pose, singular ones included.
 
         Args:
             q: joint angles, rad.
-            twist: displacement of the tip in the base frame: linear (m), then a rotation vector (rad).
+            twist: displacement of the tip in the base frame: linear [m], then a rotation vector [rad].
             damping: lambda.
-            duration: time (s) the step takes; when given, the whole step is scaled, keeping its direction,
+            duration: time [s] the step takes; when given, the whole step is scaled, keeping its direction,
                 until no joint exceeds its velocity limit.
-            rest: joint angles (rad) to prefer; none by default.
+            rest: joint angles [rad] to prefer; none by default.
             rest_gain: share of the way to `rest` per step.
             frames: `forward(q)`, if it is known already.
 

@@ -12,12 +12,12 @@ import torch
 from dora.geometry.rotations import quaternion_apply
 
 MERGE_TOLERANCE = 1e-6
-"""Largest difference (m) between a cylinder's end and a sphere that makes them one capsule."""
+"""Largest difference [m] between a cylinder's end and a sphere that makes them one capsule."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """One primitive: centre `position` (m) and `quaternion` (wxyz) in the link frame, and `size` (m).
+    """One primitive: centre `position` [m] and `quaternion` (wxyz) in the link frame, and `size` [m].
 
     `size` is (half x, half y, half z) of a box, (radius,) of a sphere, (radius, half length) of a cylinder
     or capsule. The axis of the last two is local x, as in PhysX; a capsule's half length excludes its caps.
@@ -30,7 +30,7 @@ class Shape:
 
     @property
     def segment(self) -> np.ndarray:
-        """End points (2, 3) of the axis of a cylinder or capsule, in the link frame (m)."""
+        """End points (2, 3) of the axis of a cylinder or capsule, in the link frame [m]."""
         if len(self.size) != 2:
             raise ValueError(f"a {self.kind} has no axis")
         half = torch.tensor([self.size[1], 0.0, 0.0], dtype=torch.float64)

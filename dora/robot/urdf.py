@@ -152,7 +152,7 @@ _SIZES: dict[str, Callable[[ElementTree.Element], tuple[Literal["box", "sphere",
 def _origin(
     element: ElementTree.Element,
 ) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
-    """Position (m) and quaternion (wxyz) of an element's <origin>, the identity when it has none."""
+    """Position [m] and quaternion (wxyz) of an element's <origin>, the identity when it has none."""
     origin = element.find("origin")
     xyz = (0.0, 0.0, 0.0) if origin is None or "xyz" not in origin.attrib else _floats(origin, "xyz")
     rpy = (0.0, 0.0, 0.0) if origin is None or "rpy" not in origin.attrib else _floats(origin, "rpy")

@@ -1,6 +1,6 @@
 """Model a robot's visual meshes from a table: `python -m dora.robot.visuals robots/diana7_hit`.
 
-`visuals.yaml` lists, per mesh, parts in the link frame (m): lathed profiles, rounded cylinders, tubes along a
+`visuals.yaml` lists, per mesh, parts in the link frame [m]: lathed profiles, rounded cylinders, tubes along a
 spline, and convex hulls of spheres and rounded discs. Parts of one material become one smooth-shaded mesh in
 `meshes/NAME.glb` with a PBR material.
 """
@@ -30,7 +30,7 @@ ALONG = 16
 FILLET_STEPS = 4
 """Straight pieces of a rounded edge."""
 CREASE = np.radians(28.0)
-"""Edges with a larger angle (rad) between their faces are shaded as edges."""
+"""Edges with a larger angle [rad] between their faces are shaded as edges."""
 
 
 def build_meshes(table: Row) -> dict[str, trimesh.Scene]:

@@ -17,18 +17,18 @@ from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import Shape
 
 SAGITTA = 6e-4
-"""Deepest groove (m) between neighbouring spheres on a capsule's axis."""
+"""Deepest groove [m] between neighbouring spheres on a capsule's axis."""
 PALMAR_COSINE = 0.6
 """Contact points have normals within this cosine of the palmar direction of their link."""
 SAMPLE_DENSITY = 1e6
 """Surface samples per square metre from which contact points are chosen."""
 BURIED = -2e-4
-"""A surface sample deeper than this (m) in another shape of the straight hand is no contact point."""
+"""A surface sample deeper than this [m] in another shape of the straight hand is no contact point."""
 
 
 @dataclass(frozen=True, eq=False)
 class Capsule:
-    """Points within `radius` (m) of the segment from `start` to `end` (3,) in the frame of `body`."""
+    """Points within `radius` [m] of the segment from `start` to `end` (3,) in the frame of `body`."""
 
     body: int
     link: str
@@ -37,7 +37,7 @@ class Capsule:
     radius: float
 
     def spheres(self, sagitta: float = SAGITTA) -> np.ndarray:
-        """Centres (n, 3) on the axis so close that the spheres' union is nowhere `sagitta` (m) thinner."""
+        """Centres (n, 3) on the axis so close that the spheres' union is nowhere `sagitta` [m] thinner."""
         length = float(np.linalg.norm(self.end - self.start))
         spacing = 2 * math.sqrt(sagitta * (2 * self.radius - sagitta))
         count = math.ceil(length / spacing) + 1 if length > 0 else 1

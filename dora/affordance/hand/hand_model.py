@@ -171,7 +171,7 @@ class HandModel:
         self.spheres, self.sphere_radius = self.sphere_set()
 
     def sphere_set(self, **density: float) -> tuple[Points, Float[Tensor, " s"]]:
-        """Spheres covering the capsules, with their radii (m); `density` as of `Capsule.spheres`."""
+        """Spheres covering the capsules, with their radii [m]; `density` as of `Capsule.spheres`."""
         centers = [capsule.spheres(**density) for capsule in self.capsules]
         counts = [len(points) for points in centers]
         body = np.repeat([capsule.body for capsule in self.capsules], counts)
@@ -226,11 +226,11 @@ class HandModel:
         return torch.cat((wrist[:, None], torch.stack(found, 2).flatten(1, 2)), 1)
 
     def all_joints(self, actuated: Float[Tensor, "c a"]) -> Float[Tensor, "c j"]:
-        """Angles (rad) of all joints, finger by finger from the palm outwards, padding included as 0."""
+        """Angles [rad] of all joints, finger by finger from the palm outwards, padding included as 0."""
         return torch.addmm(self.joint_offset, actuated, self.joint_gain.T)
 
     def place(self, poses: Float[Tensor, "c b 4 4"], points: Points) -> Float[Tensor, "c p 3"]:
-        """Points in the frame of `poses` (m)."""
+        """Points in the frame of `poses` [m]."""
         count = len(poses)
         rows = poses[:, 1:, :3].unflatten(1, (self.fingers, self.depth)).permute(1, 0, 3, 2, 4)
         found = torch.bmm(rows.reshape(self.fingers, 3 * count, -1), points.on_fingers)
@@ -246,7 +246,7 @@ class HandModel:
 
         Args:
             poses: of `forward`.
-            wrench: force (N) and moment about the origin of the frame of `poses` (N m), per body. With
+            wrench: force [N] and moment about the origin of the frame of `poses` [N m], per body. With
                 dE/dp as force on every point p the results are the gradient of E.
 
         Returns:

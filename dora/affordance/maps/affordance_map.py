@@ -31,12 +31,12 @@ class AffordanceMap:
 
     Attributes:
         name: of the object.
-        points: (p, 3) (m).
+        points: (p, 3) [m].
         normals: (p, 3) unit, outward.
-        areas: (p,) area for which each point stands (m^2).
+        areas: (p,) area for which each point stands [m^2].
         labels: (p,) index into `names`.
         names: of the regions.
-        mesh: the surface itself (m).
+        mesh: the surface itself [m].
         face_labels: (f,) index into `names` of every face of `mesh`.
         digest: of the object's labelled surface.
     """
@@ -85,7 +85,7 @@ class AffordanceMap:
 
     @property
     def spacing(self) -> float:
-        """Typical distance (m) of neighbouring points: that of a hexagonal grid with as many per area."""
+        """Typical distance [m] of neighbouring points: that of a hexagonal grid with as many per area."""
         return float((2 * self.areas.mean() / 3**0.5) ** 0.5)
 
     def label_index(self, label: str) -> int:
@@ -101,7 +101,7 @@ class AffordanceMap:
     def nearest_points(
         self, queries: Float[Tensor, "*b 3"], k: int
     ) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
-        """Distances (m), ascending, and indices of the k points nearest to each query (object frame, m); exact.
+        """Distances [m], ascending, and indices of the k points nearest to each query ([m], object frame); exact.
 
         Quick for queries within a few spacings of the surface; others are compared with all points. The table
         behind it is made when k is first asked for.
@@ -119,12 +119,12 @@ class AffordanceMap:
         return distance.view(shape), index.view(shape)
 
     def nearest(self, queries: Float[Tensor, "*b 3"], k: int) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
-        """Distances (m), ascending, and labels of the k points nearest to each query; as `nearest_points`."""
+        """Distances [m], ascending, and labels of the k points nearest to each query; as `nearest_points`."""
         distance, index = self.nearest_points(queries, k)
         return distance, self.labels[index]
 
     def region_distance(self, queries: Float[Tensor, "*b 3"], label: str) -> Float[Tensor, "*b"]:
-        """Unsigned distance (m) of queries (object frame, m) to a region's surface, interpolated on a grid.
+        """Unsigned distance [m] of queries ([m], object frame) to a region's surface, interpolated on a grid.
 
         Differentiable; the grid behind it is made when a label is first asked for.
 

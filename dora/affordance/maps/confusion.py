@@ -52,6 +52,6 @@ class Agreement:
 
 
 def clearly_held(force: Float[Tensor, "c l"]) -> Bool[Tensor, " c"]:
-    """Whether one region carries at least `CLEAR` of a grasp's force, from the force (N) on every region."""
+    """Whether one region carries at least `CLEAR` of a grasp's force, from the force [N] on every region."""
     total = force.sum(1)
     return (total > 0) & (force.amax(1) >= CLEAR * total)

@@ -11,7 +11,7 @@ from dora.affordance.objects.signed_distance import CHANNELS, SignedDistanceFiel
 from dora.geometry.rotations import matrix_from_quaternion
 
 TOUCH = 5e-3
-"""Distance (m) between hand and surface below which they are in contact."""
+"""Distance [m] between hand and surface below which they are in contact."""
 CHUNK = 2_000_000
 """Point-capsule pairs measured at once, which bounds memory."""
 
@@ -27,12 +27,12 @@ def contact_semantic_map(
     """M_CoS(p_i) = the part of the hand whose links are nearest to p_i, or 0 if farther than `touch`.
 
     Args:
-        points: of the object's surface (object frame, m).
-        position: of the wrist in the object frame (m).
+        points: of the object's surface ([m], object frame).
+        position: of the wrist in the object frame [m].
         quaternion: of the wrist in the object frame, wxyz.
-        joints: all hand joints (rad), in the order of `RobotDescription.hand`.
+        joints: all hand joints [rad], in the order of `RobotDescription.hand`.
         hand: the hand.
-        touch: largest distance (m) of a contact; points inside the hand are in contact.
+        touch: largest distance [m] of a contact; points inside the hand are in contact.
 
     Returns:
         0 no contact, 1 palm, 2 thumb, 3 index, 4 middle, 5 ring, 6 pinky.
@@ -70,7 +70,7 @@ def hand_contacts(
         hand: the hand.
         field: of the object.
         poses: of `HandModel.forward`, in the object frame.
-        touch: links farther than this (m) have class 0.
+        touch: links farther than this [m] have class 0.
     """
     points = hand.place(poses, hand.contacts)
     bodies, counts = torch.unique_consecutive(hand.contacts.body, return_counts=True)
@@ -106,7 +106,7 @@ def pressed_contacts(
 
 
 def wrist_matrix(position: Float[Tensor, "c 3"], quaternion: Float[Tensor, "c 4"]) -> Float[Tensor, "c 4 4"]:
-    """Homogeneous pose of a position (m) and a quaternion (wxyz)."""
+    """Homogeneous pose of a position [m] and a quaternion (wxyz)."""
     pose = torch.eye(4, dtype=position.dtype, device=position.device).repeat(len(position), 1, 1)
     pose[:, :3, :3] = matrix_from_quaternion(quaternion)
     pose[:, :3, 3] = position

@@ -34,8 +34,8 @@ class NearestTable:
         """Builds the table.
 
         Args:
-            points: (p, 3) (m).
-            spacing: typical distance (m) of neighbouring points.
+            points: (p, 3) [m].
+            spacing: typical distance [m] of neighbouring points.
             candidates: M; at least the largest k, and a few times as much for speed.
         """
         self.points = points
@@ -62,7 +62,7 @@ class NearestTable:
         self.reach = torch.full_like(reach, torch.inf) if all_known else reach
 
     def query(self, queries: Float[Tensor, "b 3"], k: int) -> tuple[Float[Tensor, "b k"], Int[Tensor, "b k"]]:
-        """Distances (m), ascending, and indices of the k nearest points; k is at most `candidates`."""
+        """Distances [m], ascending, and indices of the k nearest points; k is at most `candidates`."""
         cell = ((queries - self.low) / self.edge).floor().long()
         inside = ((cell >= 0) & (cell < self.shape)).all(-1)
         cell = torch.where(inside[:, None], cell, 0)
@@ -85,7 +85,7 @@ class NearestTable:
 def nearest_by_comparison(
     points: Float[Tensor, "p 3"], queries: Float[Tensor, "b 3"], k: int
 ) -> tuple[Float[Tensor, "b k"], Int[Tensor, "b k"]]:
-    """Distances (m), ascending, and indices of the k nearest points, from all distances; slow and exact."""
+    """Distances [m], ascending, and indices of the k nearest points, from all distances; slow and exact."""
     found = [
         torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist").topk(k, largest=False)
         for part in queries.split(CHUNK)
@@ -102,16 +102,16 @@ class RegionField:
     """
 
     NODE = 0.004
-    """Distance of the nodes (m)."""
+    """Distance of the nodes [m]."""
     MARGIN = 0.05
-    """Room of the grid around the mesh (m)."""
+    """Room of the grid around the mesh [m]."""
     MOST_NODES = 400_000
     """Nodes move apart if there would be more."""
     NEAR = 1.0
     """Interpolated distance, in distances of the nodes, below which the nearest point is interpolated."""
 
     def __init__(self, mesh: trimesh.Trimesh, device: torch.device | str = "cpu"):
-        """Builds the grid around a mesh (m), which may be open."""
+        """Builds the grid around a mesh [m], which may be open."""
         low, high = mesh.bounds[0] - self.MARGIN, mesh.bounds[1] + self.MARGIN
         self.node = max(self.NODE, float((high - low).prod() / self.MOST_NODES) ** (1 / 3))
         count = np.ceil((high - low) / self.node).astype(int) + 1
@@ -124,7 +124,7 @@ class RegionField:
         self.low, self.last = self.values.new_tensor(low), torch.tensor(count - 1, device=device)
 
     def __call__(self, queries: Float[Tensor, "b 3"]) -> Float[Tensor, " b"]:
-        """Distance (m); differentiable almost everywhere."""
+        """Distance [m]; differentiable almost everywhere."""
         place = (queries - self.low) / self.node
         values = torch.nn.functional.grid_sample(
             self.values, (2 * place / self.last - 1).flip(-1)[None, None, None], align_corners=True

@@ -29,7 +29,7 @@ def sample_evenly(
     Eurographics 2015, equations 3 to 5. The two sides of a thin wall do not crowd each other.
 
     Returns:
-        points (m), the face of each, and the area (m^2) for which each stands; the areas sum to that of the mesh.
+        points [m], the face of each, and the area [m^2] for which each stands; the areas sum to that of the mesh.
     """
     rng = np.random.default_rng(seed)
     points, faces = trimesh.sample.sample_surface(mesh, OVERSAMPLING * count, seed=rng)[:2]

@@ -60,7 +60,7 @@ def vote(
 
     Args:
         map: affordance map.
-        contacts: points in the object frame (m).
+        contacts: points in the object frame [m].
         finger: contact class of every point: 0 none (its point is not looked at), 1 palm, 2 thumb ... 6 pinky.
         settings: N and the weights.
     """

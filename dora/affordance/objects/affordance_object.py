@@ -16,12 +16,12 @@ from dora.robot.shapes import Shape
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 """Resting orientation (wxyz) of an object that stands on a table as it was modelled."""
 DIGEST_LENGTH = 1e-7
-"""Lengths in a digest are rounded to this (m); areas and second moments to its square and fourth power."""
+"""Lengths in a digest are rounded to this [m]; areas and second moments to its square and fourth power."""
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """One convex collision shape in the object frame: a primitive, or a convex hull as a mesh (m).
+    """One convex collision shape in the object frame: a primitive, or a convex hull as a mesh [m].
 
     Attributes:
         label: region that the piece carries; one of the object's labels.
@@ -32,7 +32,7 @@ class Piece:
     shape: Shape | trimesh.Trimesh
 
     def moved(self, offset: Float[np.ndarray, " 3"]) -> Piece:
-        """The same piece, translated by `offset` (m)."""
+        """The same piece, translated by `offset` [m]."""
         if isinstance(self.shape, Shape):
             x, y, z = (float(v) for v in np.asarray(self.shape.position) + offset)
             return replace(self, shape=replace(self.shape, position=(x, y, z)))
@@ -41,7 +41,7 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class AffordanceObject:
-    """A rigid object with a labelled surface. Its frame is that of its mesh (m), origin at the centre of mass.
+    """A rigid object with a labelled surface. Its frame is that of its mesh [m], origin at the centre of mass.
 
     Attributes:
         name: "jug", or the stem of a user's file.
@@ -52,9 +52,9 @@ class AffordanceObject:
         target: region that a task wants held.
         solid: watertight; `mesh` with its cavity filled. A hand keeps out of it.
         mass: kg.
-        inertia: (3, 3) about the origin (kg m^2).
+        inertia: (3, 3) about the origin [kg m^2].
         pieces: convex collision shapes; few, since physics pays for each.
-        support: height (m) of the origin above the table on which the object rests.
+        support: height [m] of the origin above the table on which the object rests.
         rest: orientation (wxyz) of the object frame at rest on a horizontal table.
         digest: sha256 of the labelled surface, see `surface_digest`.
     """
@@ -84,14 +84,14 @@ class AffordanceObject:
         return self.labels.index(label)
 
     def region(self, label: str) -> trimesh.Trimesh:
-        """The surface of one region (open mesh, object frame, m); raises InputError as `label_index` does."""
+        """The surface of one region ([m], open mesh in the object frame); raises InputError as `label_index` does."""
         faces = np.flatnonzero(self.face_labels == self.label_index(label))
         part = self.mesh.submesh([faces], append=True)
         assert isinstance(part, trimesh.Trimesh)
         return part
 
     def centroid(self, label: str) -> Float[np.ndarray, " 3"]:
-        """Area-weighted centre of a region (object frame, m); raises InputError as `label_index` does."""
+        """Area-weighted centre of a region ([m], object frame); raises InputError as `label_index` does."""
         faces = self.face_labels == self.label_index(label)
         return np.average(self.mesh.triangles_center[faces], axis=0, weights=self.mesh.area_faces[faces])
 
@@ -111,11 +111,11 @@ def assemble(
 
     Args:
         name: of the object.
-        mesh: watertight surface (m).
+        mesh: watertight surface [m].
         face_labels: (F,) index into `regions` of every face.
         regions: label -> grasp class, in the order of the indices.
         target: label that a task wants held.
-        weights: watertight bodies with uniform density and their masses (kg); they need not be `mesh`.
+        weights: watertight bodies with uniform density and their masses [kg]; they need not be `mesh`.
         pieces: collision shapes.
         solid: `mesh` without cavities, if it has one.
         rest: orientation (wxyz) at rest on a table.
@@ -140,12 +140,12 @@ def assemble(
 
 
 def moved(mesh: trimesh.Trimesh, offset: Float[np.ndarray, " 3"]) -> trimesh.Trimesh:
-    """A copy of a mesh, translated (m)."""
+    """A copy of a mesh, translated [m]."""
     return trimesh.Trimesh(mesh.vertices + offset, mesh.faces, process=False)
 
 
 def support_height(mesh: trimesh.Trimesh, rest: tuple[float, float, float, float]) -> float:
-    """Height (m) of the origin above the lowest point of a mesh turned by the quaternion `rest` (wxyz)."""
+    """Height [m] of the origin above the lowest point of a mesh turned by the quaternion `rest` (wxyz)."""
     turn = trimesh.transformations.quaternion_matrix(rest)[:3, :3]
     return float(-(mesh.vertices @ turn[2]).min())
 
@@ -153,10 +153,10 @@ def support_height(mesh: trimesh.Trimesh, rest: tuple[float, float, float, float
 def mass_properties(
     weights: Sequence[tuple[trimesh.Trimesh, float]],
 ) -> tuple[float, Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:
-    """Mass (kg), centre of mass (3,) (m) and inertia (3, 3) about it (kg m^2) of bodies of uniform density.
+    """Mass [kg], centre of mass (3,) [m] and inertia (3, 3) about it [kg m^2] of bodies of uniform density.
 
     Args:
-        weights: watertight meshes (m) with their masses (kg).
+        weights: watertight meshes [m] with their masses [kg].
 
     The inertia follows the parallel axis theorem, I = sum I_k + m_k (|r_k|^2 1 - r_k r_k^T).
     """

@@ -28,7 +28,7 @@ HULL_VERTICES = 200
 SAMPLES = 20_000
 """Points of a surface at which the deviation is measured."""
 TOUCHING = 1e-5
-"""Points of one hull nearer to another hull (m) lie on a cut between the two, not on the surface of the union."""
+"""Points of one hull nearer to another hull [m] lie on a cut between the two, not on the surface of the union."""
 CACHE_VARIABLE = "DORA_CACHE"
 FORMAT = "dora-hulls 1"
 """Format and version of a file of hulls."""
@@ -36,7 +36,7 @@ FORMAT = "dora-hulls 1"
 
 @dataclass(frozen=True)
 class Deviation:
-    """Distance (m) between a mesh and the union of convex hulls that stands for it.
+    """Distance [m] between a mesh and the union of convex hulls that stands for it.
 
     Attributes:
         outward: farthest point of the union outside the mesh.
@@ -63,7 +63,7 @@ def decompose(
     ACM Transactions on Graphics 41(4), 2022. Holes stay open, unlike with a single hull.
 
     Args:
-        mesh: watertight (m).
+        mesh: watertight [m].
         threshold: largest concavity of a hull, as a share of the mesh's size; .01 is fine, 1 is a single hull.
         cache_dir: where to keep the hulls; `cache_folder()` if None.
 
@@ -108,7 +108,7 @@ def _outside_of_others(
 
 
 def _signed_distance(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Distance (m) to a watertight surface, negative inside."""
+    """Distance [m] to a watertight surface, negative inside."""
     vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
     signed = igl.signed_distance(np.array(points), vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)
     return np.asarray(signed[0])

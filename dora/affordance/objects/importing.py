@@ -19,12 +19,12 @@ from dora.errors import InputError
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Metres per unit of length."""
 SMALLEST, LARGEST = 0.005, 2.0
-"""Longest side (m) of an object that a hand could meet."""
+"""Longest side [m] of an object that a hand could meet."""
 MOST_FACES = 200_000
 DENSITY = 600.0
-"""Density (kg/m^3), of wood, where no mass is given."""
+"""Density [kg/m^3], of wood, where no mass is given."""
 STABLE = 0.002
-"""An object stands as modelled if its centre of mass is at least this far (m) inside the outline of its foot."""
+"""An object stands as modelled if its centre of mass is at least this far [m] inside the outline of its foot."""
 
 
 def import_object(

@@ -23,17 +23,17 @@ os.environ.setdefault("IGL_NUM_THREADS", "1")  # read once, when libigl is first
 import igl
 
 SPACING = 2.5e-3
-"""Grid spacing (m)."""
+"""Grid spacing [m]."""
 MARGIN = 0.05
-"""Width (m) of the grid around the object's bounding box; more than the radius of any hand capsule."""
+"""Width [m] of the grid around the object's bounding box; more than the radius of any hand capsule."""
 COARSENING = 4
 """Ratio of the coarse and the fine spacing."""
 BAND = 0.01
-"""Nodes within this distance (m) of the surface are exact."""
+"""Nodes within this distance [m] of the surface are exact."""
 MAX_NODES = 1.6e7
 """Largest grid, whose nodes float32 can still count; a larger object is absurdly large for a hand."""
 CHANNELS = 4
-"""Columns of a field's table without the region: distance (m) and unit gradient (3,)."""
+"""Columns of a field's table without the region: distance [m] and unit gradient (3,)."""
 _TINY = 1e-12
 CULL = 1.25
 """|interpolated value - value at the nearest node| is at most this times the spacing, gradients being unit."""
@@ -41,7 +41,7 @@ CULL = 1.25
 
 @dataclass(frozen=True)
 class FieldError:
-    """Error (m) of a field against the mesh at points within `reach` (m) of its surface."""
+    """Error [m] of a field against the mesh at points within `reach` [m] of its surface."""
 
     mean: float
     largest: float
@@ -49,14 +49,14 @@ class FieldError:
 
 
 class ExactDistance:
-    """Exact signed distance to a watertight mesh (m) by libigl, on one thread."""
+    """Exact signed distance to a watertight mesh [m] by libigl, on one thread."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self._vertices = np.array(mesh.vertices, dtype=np.float64)
         self._faces = np.array(mesh.faces, dtype=np.int64)
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Signed distance (m) of points in the mesh's frame."""
+        """Signed distance [m] of points in the mesh's frame."""
         return self.with_gradient(points)[:, 0]
 
     def with_gradient(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
@@ -72,7 +72,7 @@ class ExactDistance:
         return np.column_stack((distance, gradient))
 
     def unsigned(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Distance (m) to the surface, which need not be closed."""
+        """Distance [m] to the surface, which need not be closed."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         return np.sqrt(igl.point_mesh_squared_distance(points, self._vertices, self._faces)[0])
 
@@ -81,16 +81,16 @@ class SignedDistanceField:
     """Signed distance, its gradient and optionally the distance to a region on a regular grid.
 
     Args:
-        solid: watertight mesh (m) with outward faces.
-        region: open surface (m), part of the object, to which the last channel is the unsigned distance.
+        solid: watertight mesh [m] with outward faces.
+        region: open surface [m], part of the object, to which the last channel is the unsigned distance.
         dtype: floating type of every tensor.
         device: torch device of every tensor.
-        spacing: grid spacing (m).
+        spacing: grid spacing [m].
 
     Attributes:
         exact: the exact distance to `solid`.
         table: (nodes, 4 or 5) distance, unit gradient, distance to the region; the last axis runs fastest.
-        shape: nodes along x, y, z; `lower`, `upper` (3,) are the positions of the first and the last (m).
+        shape: nodes along x, y, z; `lower`, `upper` (3,) are the positions of the first and the last [m].
 
     Raises:
         InputError: the object is too large for a grid of this spacing.
@@ -129,7 +129,7 @@ class SignedDistanceField:
         self.lower, self.upper = self.table.new_tensor(lower), self.table.new_tensor(lower + (fine - 1) * spacing)
 
     def may_touch(self, points: Float[Tensor, "c p 3"], reach: Float[Tensor, " p"]) -> Int[Tensor, " n"]:
-        """Flat indices into (c, p) of all points whose interpolated distance may be below `reach` (p,) (m).
+        """Flat indices into (c, p) of all points whose interpolated distance may be below `reach` (p,) [m].
 
         A point that is left out is farther away. Costs one look-up of the nearest node.
         """
@@ -144,7 +144,7 @@ class SignedDistanceField:
     def sample(
         self, points: Float[Tensor, "n 3"], channels: int | None = None
     ) -> tuple[Float[Tensor, "n k"], Float[Tensor, "n k 3"]]:
-        """Interpolated channels of the table, and the exact derivatives of the interpolant (per m).
+        """Interpolated channels of the table, and the exact derivatives of the interpolant [1/m].
 
         Outside the grid the distances grow by the distance to the grid, and gradients stay constant.
         """
@@ -168,7 +168,7 @@ class SignedDistanceField:
         return value, jacobian
 
     def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Interpolated signed distance (m)."""
+        """Interpolated signed distance [m]."""
         return self.sample(points.reshape(-1, 3), 1)[0].reshape(points.shape[:-1])
 
     def error(self, count: int = 20_000, reach: float = BAND, seed: int = 0) -> FieldError:

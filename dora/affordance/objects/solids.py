@@ -20,7 +20,7 @@ AROUND = 24
 FIT_STEPS = 20
 """Steps of the fit; after them corners still slide along the path, but the polyline comes no nearer to it."""
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
-"""Turn (rad) between directions of a spiral that spreads evenly over a sphere."""
+"""Turn [rad] between directions of a spiral that spreads evenly over a sphere."""
 
 
 def lathe(profile: Float[np.ndarray, "n 2"], sections: int) -> trimesh.Trimesh:
@@ -74,7 +74,7 @@ def spline(knots: Float[np.ndarray, "k d"], points: int) -> Float[np.ndarray, "m
 
 
 def arc(center: tuple[float, float], radius: float, start: float, end: float, points: int) -> Float[np.ndarray, "m 2"]:
-    """Points of a circle from one angle (deg) to another."""
+    """Points of a circle from one angle [deg] to another."""
     angle = np.radians(np.linspace(start, end, points))
     return np.stack([center[0] + radius * np.cos(angle), center[1] + radius * np.sin(angle)], -1)
 
@@ -104,7 +104,7 @@ def capsule_between(start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"]
 
 
 def shape_mesh(shape: Shape) -> trimesh.Trimesh:
-    """A collision primitive as a watertight mesh, in the frame in which the primitive is placed (m)."""
+    """A collision primitive as a watertight mesh, in the frame in which the primitive is placed [m]."""
     if shape.kind == "box":
         mesh = trimesh.creation.box(extents=[2 * half for half in shape.size])
     elif shape.kind == "sphere":

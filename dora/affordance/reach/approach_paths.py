@@ -64,7 +64,7 @@ class ReachSettings:
 
 @dataclass(frozen=True, eq=False)
 class Goals:
-    """n wrist poses (m, wxyz) in the base frame, each with the unit direction of its approach."""
+    """n wrist poses ([m], wxyz) in the base frame, each with the unit direction of its approach."""
 
     position: Float[Tensor, "n 3"]
     quaternion: Float[Tensor, "n 4"]

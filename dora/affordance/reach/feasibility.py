@@ -201,7 +201,7 @@ class Reach:
         return hit
 
     def wrist_pose(self, q: Float[Tensor, " dof"]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 4"]]:
-        """Pose (m, wxyz) of the wrist in the base frame at arm joints [rad]."""
+        """Pose ([m], wxyz) of the wrist in the base frame at arm joints [rad]."""
         position, rotation = self.kinematics.chain.tip_pose(q[None])
         return position[0], quaternion_from_matrix(rotation)[0]
 

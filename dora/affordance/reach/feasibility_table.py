@@ -158,7 +158,7 @@ class ReachTable:
         return table
 
     def mask(self, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]) -> Bool[Tensor, "b c"]:
-        """Feasible candidates for objects at world poses (m, wxyz); a row without any is the empty case.
+        """Feasible candidates for objects at world poses ([m], wxyz); a row without any is the empty case.
 
         An object off the grid, above the table or tipped over has none.
         """

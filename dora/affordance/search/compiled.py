@@ -50,7 +50,7 @@ class CompiledEnergy(GraspEnergy):
         return np.array([getattr(self.weights, name) * (ramp if name in RAMPED else 1.0) for name in TERMS])
 
     def plane(self) -> np.ndarray:
-        """Normal and offset (m) of the table, for compiled functions; infinitely far if there is none."""
+        """Normal and offset [m] of the table, for compiled functions; infinitely far if there is none."""
         normal, offset = ((0.0, 0.0, 0.0), math.inf) if self.table is None else (self.table.normal, self.table.offset)
         return np.array([*normal, offset])
 

@@ -23,7 +23,7 @@ class Rows:
     """Candidates under search.
 
     `wrist` (c, 4, 4) in the object frame, `joints` (c, a) in rad, `contacts` (c, k) indices of contact points,
-    `mean` and `square` (c, 6 + a) Adam's moments, `total` (c,) energy and `overlap` (c,) sum of the terms `RAMPED` (m)
+    `mean` and `square` (c, 6 + a) Adam's moments, `total` (c,) energy and `overlap` (c,) sum of the terms `RAMPED` [m]
     when last looked at.
     """
 
@@ -68,7 +68,7 @@ class Descent:
 
     Args:
         energy: what is to fall.
-        largest: (6 + a,) largest steps of translation (m), rotation (rad) and joints (rad).
+        largest: (6 + a,) largest steps of translation [m], rotation [rad] and joints [rad].
     """
 
     def __init__(self, energy: GraspEnergy, largest: Float[Tensor, " m"]) -> None:
@@ -91,5 +91,5 @@ class Descent:
 
 
 def overlap(found: Evaluation) -> Float[Tensor, " c"]:
-    """Sum of the terms that have to vanish in the end (m)."""
+    """Sum of the terms that have to vanish in the end [m]."""
     return torch.stack([found.terms[name] for name in RAMPED if name in found.terms]).sum(0)

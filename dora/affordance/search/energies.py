@@ -3,13 +3,13 @@
 | term | part | value |
 |---|---|---|
 | closure | E_DFC | ||G c||^2 at the hand's contact points, c the object's inward normals there |
-| distance | E_HO | sum over contact points of abs(signed distance) (m), times `PALM_IMPORTANCE` for the palm |
-| region | E_HO | sum over contact points of the distance to the region to be held (m) |
-| closing | E_HO | sum over contact points on fingers of their miss when the hand closes a little (m) |
-| penetration | E_HO | sum over the hand's spheres of their overlap with the object and a thin skin around it (m) |
-| table | E_HO | sum over the spheres of their depth below the table plus a clearance (m) |
-| limits | E_Robot | sum over the joints of the angle beyond a limit (rad) |
-| self_penetration | E_Robot | sum over pairs of capsules that may collide of their overlap (m) |
+| distance | E_HO | sum over contact points of abs(signed distance) [m], times `PALM_IMPORTANCE` for the palm |
+| region | E_HO | sum over contact points of the distance to the region to be held [m] |
+| closing | E_HO | sum over contact points on fingers of their miss when the hand closes a little [m] |
+| penetration | E_HO | sum over the hand's spheres of their overlap with the object and a thin skin around it [m] |
+| table | E_HO | sum over the spheres of their depth below the table plus a clearance [m] |
+| limits | E_Robot | sum over the joints of the angle beyond a limit [rad] |
+| self_penetration | E_Robot | sum over pairs of capsules that may collide of their overlap [m] |
 
 All positions are in the object frame. A term yields its value per candidate and forces dE/dp on points of
 the hand; the principle of virtual work (`HandModel.pull_back`) turns those into the gradient with respect
@@ -31,17 +31,17 @@ from dora.affordance.hand.protocol import STANDARD, flexion
 from dora.affordance.objects.signed_distance import CHANNELS, SignedDistanceField
 
 LENGTH = 0.1
-"""Unit of length (m) of the positions psi in G, so that force and torque have comparable size."""
+"""Unit of length [m] of the positions psi in G, so that force and torque have comparable size."""
 CLEARANCE = 3e-3
-"""Distance (m) that the hand keeps from the table."""
+"""Distance [m] that the hand keeps from the table."""
 PALM_IMPORTANCE = 3.0
 """Factor on the distance of contact points on the palm: it cannot close towards the object as fingers do."""
 CLOSING = 0.25
 """Share of the protocol's squeeze by which the term `closing` closes the hand."""
 PRESS = 2e-3
-"""Depth (m) in the object that a contact point should reach then."""
+"""Depth [m] in the object that a contact point should reach then."""
 SKIN = 7e-4
-"""Overlap (m) is counted from this far outside the surface: what spheres and interpolation miss."""
+"""Overlap [m] is counted from this far outside the surface: what spheres and interpolation miss."""
 _SMALL = 1e-9
 
 
@@ -85,8 +85,8 @@ class Push(NamedTuple):
 class Evaluation(NamedTuple):
     """Weighted sum `total` (c,), unweighted `terms`, and the gradient of `total`.
 
-    `wrist` (c, 6): with respect to the wrist's translation (m) and rotation vector (rad) about its origin,
-    both in the object frame; `joints` (c, a): with respect to the actuated joints (rad).
+    `wrist` (c, 6): with respect to the wrist's translation [m] and rotation vector [rad] about its origin,
+    both in the object frame; `joints` (c, a): with respect to the actuated joints [rad].
     """
 
     total: Float[Tensor, " c"]
@@ -162,7 +162,7 @@ class GraspEnergy:
     def contact_points(
         self, poses: Float[Tensor, "c b 4 4"], contacts: Int[Tensor, "c k"]
     ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, "n 3"]]:
-        """Row, body and position (m) of n = c k contact points."""
+        """Row, body and position [m] of n = c k contact points."""
         count, each = contacts.shape
         row = torch.arange(count, device=contacts.device).repeat_interleave(each)
         body = self.hand.contacts.body[contacts].flatten()
@@ -245,7 +245,7 @@ class GraspEnergy:
     def close_pairs(
         self, poses: Float[Tensor, "c b 4 4"]
     ) -> tuple[Int[Tensor, " n"], Int[Tensor, "2 n"], Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-        """Pairs of capsules that may overlap: row, capsules, nearest points of their axes, gap of surfaces (m)."""
+        """Pairs of capsules that may overlap: row, capsules, nearest points of their axes, gap of surfaces [m]."""
         ends = self.hand.place(poses, self.hand.ends)
         ends = ends - poses[:, None, 0, :3, 3]
         middle = 0.5 * (ends[:, 0::2] + ends[:, 1::2])
@@ -259,7 +259,7 @@ class GraspEnergy:
         return row, torch.stack((a, b)), *near, gap
 
     def limits(self, joints: Float[Tensor, "c a"]) -> tuple[Float[Tensor, " c"], Float[Tensor, "c a"]]:
-        """Sum of the angles (rad) beyond the limits of all joints, coupled ones included, and its gradient."""
+        """Sum of the angles [rad] beyond the limits of all joints, coupled ones included, and its gradient."""
         angle = self.hand.all_joints(joints)
         above, below = angle - self.hand.joint_upper, self.hand.joint_lower - angle
         value = above.clamp_min(0).sum(1) + below.clamp_min(0).sum(1)

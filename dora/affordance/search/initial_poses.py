@@ -16,7 +16,7 @@ from dora.affordance.objects.affordance_object import AffordanceObject
 SAMPLES = 2048
 """Surface points to start from."""
 NEIGHBOURHOOD = 0.03
-"""Radius (m) in which the long axis of a part is estimated."""
+"""Radius [m] in which the long axis of a part is estimated."""
 ELONGATED = 1.5
 """A neighbourhood whose extents along its two longest axes differ less than this ratio has no long axis."""
 
@@ -26,10 +26,10 @@ class Spread:
     """Random spread of initial poses.
 
     Attributes:
-        gap: range of the distance between palm and surface point (m).
-        tilt: deviation of the palm's normal from the surface's (rad, one sigma per component).
-        roll: deviation of the hand's across axis from the part's long axis (rad, one sigma).
-        abduction: deviation (rad) of joints whose range contains zero in its middle half.
+        gap: range of the distance between palm and surface point [m].
+        tilt: deviation of the palm's normal from the surface's ([rad], one sigma per component).
+        roll: deviation of the hand's across axis from the part's long axis ([rad], one sigma).
+        abduction: deviation [rad] of joints whose range contains zero in its middle half.
         flexion: mean and deviation of all other joints, as a share of their range.
     """
 
@@ -63,7 +63,7 @@ class InitialPoses:
         self.center = self.points.new_tensor(palm.center)
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c a"]]:
-        """Wrist poses in the object frame and actuated joints (rad)."""
+        """Wrist poses in the object frame and actuated joints [rad]."""
         spread, new = self.spread, self.points
 
         def normal(*shape: int) -> Tensor:

@@ -36,9 +36,9 @@ OFF_TABLE = ("hammer", "microwave")
 OPENINGS = (0.25, 0.5, 0.75, 1.0)
 """Shares of the protocol's opening that are tried."""
 OPENING_DEPTH = 1e-3
-"""Overlap (m) with the object up to which a finger counts as clear of it."""
+"""Overlap [m] with the object up to which a finger counts as clear of it."""
 SHALLOW = 9e-4
-"""Penetration (m) above which a candidate comes after those with less."""
+"""Penetration [m] above which a candidate comes after those with less."""
 SEATING = Steps(closing=60, settling=20, weight=0)
 """Steps of the hand that closes around the object."""
 NO_CLASS = "NoContact"
@@ -193,8 +193,8 @@ def seated(energy: CompiledEnergy, rows: Rows, mass: float, squeezed: float) -> 
     Args:
         energy: knows hand, object and table.
         rows: with the fingers about where they should touch.
-        mass: of the object (kg).
-        squeezed: how far the command goes beyond the posture (rad).
+        mass: of the object [kg].
+        squeezed: how far the command goes beyond the posture [rad].
     """
     robot = energy.hand.robot
     full = robot.expand_hand(rows.joints)
@@ -209,7 +209,7 @@ def opened(energy: GraspEnergy, wrist: Float[Tensor, "c 4 4"], joints: Float[Ten
     Args:
         energy: knows hand and object.
         wrist: pose of the wrist in the object frame.
-        joints: all hand joints in contact (rad), in the order of `RobotDescription.hand`.
+        joints: all hand joints in contact [rad], in the order of `RobotDescription.hand`.
     """
     hand = energy.hand
     wide = pregrasp(hand.robot, joints)

@@ -11,9 +11,9 @@ from dora.affordance.objects.signed_distance import SignedDistanceField
 from dora.affordance.search.energies import GraspEnergy
 
 DENSE = 1e-4
-"""Sagitta (m) of the dense spheres: their union is at most this much thinner than the capsules."""
+"""Sagitta [m] of the dense spheres: their union is at most this much thinner than the capsules."""
 FIELD_ERROR = 2e-3
-"""Bound (m) on the field's error near the surface; spheres farther away are not measured exactly."""
+"""Bound [m] on the field's error near the surface; spheres farther away are not measured exactly."""
 
 
 class Penetration:
@@ -24,7 +24,7 @@ class Penetration:
         self.spheres, self.radius = hand.sphere_set(sagitta=DENSE)
 
     def __call__(self, poses: Float[Tensor, "c b 4 4"]) -> Float[Tensor, " c"]:
-        """Deepest overlap (m) of every row, at least 0; `poses` as of `HandModel.forward`."""
+        """Deepest overlap [m] of every row, at least 0; `poses` as of `HandModel.forward`."""
         centers = self.hand.place(poses, self.spheres)
         near = self.field.may_touch(centers, self.radius + FIELD_ERROR)
         points = centers.view(-1, 3)[near]
@@ -36,6 +36,6 @@ class Penetration:
 
 
 def self_penetration(energy: GraspEnergy, poses: Float[Tensor, "c b 4 4"]) -> Float[Tensor, " c"]:
-    """Deepest overlap (m) of two capsules of the hand that may collide, at least 0."""
+    """Deepest overlap [m] of two capsules of the hand that may collide, at least 0."""
     row, _, _, _, gap = energy.close_pairs(poses)
     return gap.new_zeros(len(poses)).scatter_reduce_(0, row, (-gap).clamp_min(0), "amax")

@@ -26,7 +26,7 @@ SAFETY = 2.0
 FINGER_CONTACTS = 4.0
 """Contacts on whose stiffness the step sizes of the joints count."""
 MUCH = 0.01
-"""Displacement (m) that outweighs an e-fold of force."""
+"""Displacement [m] that outweighs an e-fold of force."""
 SHIFT_SHARE = 0.3
 """What a shift by closing counts against a displacement under weight."""
 
@@ -35,11 +35,11 @@ class Holding(NamedTuple):
     """Result of `hold` for c candidates.
 
     Attributes:
-        shift: (c,) how far closing moves the object (m).
-        displacement: (c, 6) farthest the object is from where closing left it, up to every direction (m).
-        force: (c,) sum of normal forces after closing (N).
+        shift: (c,) how far closing moves the object [m].
+        displacement: (c, 6) farthest the object is from where closing left it, up to every direction [m].
+        force: (c,) sum of normal forces after closing [N].
         wrist: (c, 4, 4) pose of the wrist in the object frame after closing.
-        joints: (c, j) all hand joints after closing (rad), in the order of `RobotDescription.hand`.
+        joints: (c, j) all hand joints after closing [rad], in the order of `RobotDescription.hand`.
     """
 
     shift: Float[Tensor, " c"]
@@ -74,9 +74,9 @@ def hold(
     Args:
         energy: knows hand and object.
         wrist: pose of the wrist in the object frame.
-        opened: all hand joints before closing (rad), in the order of `RobotDescription.hand`.
+        opened: all hand joints before closing [rad], in the order of `RobotDescription.hand`.
         squeezed: command of all hand joints.
-        mass: of the object (kg).
+        mass: of the object [kg].
         protocol: has friction, gravity.
         steps: of the model.
         on_table: whether the hand stays above the energy's table.
@@ -111,7 +111,7 @@ def hold(
 
 
 def _levers(hand: HandModel) -> np.ndarray:
-    """Distance (m) from every joint to the farthest sphere beyond it, straight hand."""
+    """Distance [m] from every joint to the farthest sphere beyond it, straight hand."""
     eye = torch.eye(4, dtype=hand.dtype)[None]
     poses = hand.forward(eye, torch.zeros_like(hand.lower)[None])
     centers = hand.place(poses, hand.spheres)[0]

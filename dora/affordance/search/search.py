@@ -42,11 +42,11 @@ class Settings:
         halving: see `field_size`.
         settle: share of the iterations after which rows that have converged stop.
         oversampling: candidates finished per candidate asked for; the best are returned.
-        seat: how far the hand then closes around the object (rad), for contacts that are not made yet; 0: not at all.
+        seat: how far the hand then closes around the object [rad], for contacts that are not made yet; 0: not at all.
         polish: gradient steps that remove overlaps after that.
-        translation: largest step of the wrist (m).
-        rotation: largest rotation of the wrist in a step (rad).
-        joint: largest step of a joint (rad).
+        translation: largest step of the wrist [m].
+        rotation: largest rotation of the wrist in a step [rad].
+        joint: largest step of a joint [rad].
         batch: candidates searched at once; more does not fit a core's cache.
         table: keep the hand above the table on which the object rests; None: unless it is one of `OFF_TABLE`.
         spread: of the initial poses.
@@ -85,7 +85,7 @@ CHECK = 5
 SETTLED = 2e-3
 """Relative change of the energy between two checks below which a row has settled."""
 TOLERANCE = 1e-4
-"""Sum of overlaps (m) that a settled row may have, skin included."""
+"""Sum of overlaps [m] that a settled row may have, skin included."""
 POLISH_STEP = 0.5
 """Largest steps of polishing, in those of the search."""
 LAST_STEP = 0.01

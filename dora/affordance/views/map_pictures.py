@@ -15,15 +15,15 @@ from dora.affordance.views.sheet import Panel, write_sheet
 from dora.files import write_bytes
 
 VIEWS = ((-1.0, 0.35), (2.4, 0.35))
-"""Azimuth and elevation (rad) of the pictures."""
+"""Azimuth and elevation [rad] of the pictures."""
 PLAIN = (225, 225, 225, 255)
 """Colour of the surface under the points."""
 DISC_CORNERS, DISC_SHARE, DISC_LIFT = 8, 0.85, 2e-4
-"""Corners of a point's disc, its radius as a share of that with its area, and its distance (m) from the surface."""
+"""Corners of a point's disc, its radius as a share of that with its area, and its distance [m] from the surface."""
 
 
 def painted(map: AffordanceMap) -> trimesh.Trimesh:
-    """The surface with each face in the colour of its region (object frame, m)."""
+    """The surface with each face in the colour of its region ([m], object frame)."""
     rgba = colours(map.face_labels, PALETTE)
     return trimesh.Trimesh(map.mesh.vertices, map.mesh.faces, face_colors=rgba, process=False)
 
@@ -50,7 +50,7 @@ def picture_map(map: AffordanceMap, path: Path | str, size: int = 400) -> None:
     Args:
         map: what to draw.
         path: of the file.
-        size: side of each of the three views (pixels).
+        size: side of each of the three views [pixels].
 
     Raises:
         InputError: the file cannot be written.
@@ -71,5 +71,5 @@ def picture_map(map: AffordanceMap, path: Path | str, size: int = 400) -> None:
 
 
 def export_glb(map: AffordanceMap, path: Path | str) -> None:
-    """Write the painted surface as binary glTF (m), which every 3D viewer shows; InputError if it cannot be written."""
+    """Write the painted surface as binary glTF [m], which every 3D viewer shows; InputError if it cannot be written."""
     write_bytes(Path(path), cast(bytes, trimesh.Scene(painted(map)).export(file_type="glb")))

@@ -107,7 +107,7 @@ class CollisionModel:
         self._broad = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager(self._model, self._geometry, self._results)
 
     def place_object(self, position: Float[np.ndarray, " 3"], quaternion: Float[np.ndarray, " 4"]) -> None:
-        """Move the object to a pose (m, wxyz) in the robot's base frame."""
+        """Move the object to a pose ([m], wxyz) in the robot's base frame."""
         pose = self._pose(position, quaternion)
         for part, local in self._pieces:
             part.placement = pose * local

@@ -133,7 +133,7 @@ class InverseKinematics:
         seeds: int = 4,
         iterations: int = 24,
     ) -> Solutions:
-        """Postures for wrist poses (m, wxyz) in the base frame, from `seeds` starts each.
+        """Postures for wrist poses ([m], wxyz) in the base frame, from `seeds` starts each.
 
         A pose that is out of reach gives the posture where the iterations ended, not solved.
         """

@@ -17,19 +17,19 @@ from dora.affordance.search.native.hand import HandArrays, cross, forward, pull_
 MOMENTUM = 0.7
 """Share of the last step that is added to the next one."""
 LARGEST_STEP = 3e-3
-"""Largest step of the object (m, and in units of `ARM` rad)."""
+"""Largest step of the object [m]; a rotation counts `ARM` m per rad."""
 LARGEST_TURN = 0.05
-"""Largest step of a joint (rad)."""
+"""Largest step of a joint [rad]."""
 ARM = 0.04
-"""Typical distance (m) of contacts from the middle of the grip."""
+"""Typical distance [m] of contacts from the middle of the grip."""
 SPARE = 5.0
 """Contacts on whose stiffness the step sizes count in addition to those that exist."""
 LOST = 0.06
-"""Displacement (m) at which a grasp is given up."""
+"""Displacement [m] at which a grasp is given up."""
 
 
 class Drives(NamedTuple):
-    """Of all joints: stiffness (N m/rad), effort (N m), and the step per torque (rad/N m)."""
+    """Of all joints: stiffness [N m/rad], effort [N m], and the step per torque [rad/[N m]]."""
 
     stiffness: np.ndarray
     effort: np.ndarray
@@ -45,7 +45,7 @@ class Steps(NamedTuple):
 
 
 class Ranking(NamedTuple):
-    """Quality of a candidate, log(1 + force/N) less (displacement + `shift_share` shift) / `much` (m), and how many of
+    """Quality of a candidate, log(1 + force/N) less (displacement + `shift_share` shift) / `much` [m], and how many of
     the best are `wanted`: the others are given up as soon as it is certain that they are not among them."""
 
     much: float
@@ -54,8 +54,8 @@ class Ranking(NamedTuple):
 
 
 class Model(NamedTuple):
-    """What is the same for all candidates: hand, distance field, drives, middle of the grip in the wrist's frame (m),
-    friction, and normal and offset (m) of the table (infinitely far if there is none)."""
+    """What is the same for all candidates: hand, distance field, drives, middle of the grip in the wrist's frame [m],
+    friction, and normal and offset [m] of the table (infinitely far if there is none)."""
 
     hand: HandArrays
     field: FieldArrays
@@ -66,7 +66,7 @@ class Model(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Of one candidate: pose of the wrist, joints, their command (rad), force of the weight on the wrist (N), the last
+    """Of one candidate: pose of the wrist, joints, their command [rad], force of the weight on the wrist [N], the last
     step, and the contacts with the object."""
 
     wrist: np.ndarray
@@ -95,15 +95,15 @@ def close_and_load(model, steps, ranking, load, directions, wrists, opened, sque
         model: a `Model`.
         steps: a `Steps`.
         ranking: a `Ranking`.
-        load: the weight (N).
+        load: the weight [N].
         directions: (d, 3) of the weight in the object frame.
         wrists: (c, 4, 4) poses in the object frame; after closing on return.
-        opened: (c, j) all joints (rad), in the order of the model; after closing on return.
-        squeezed: (c, j) command (rad).
+        opened: (c, j) all joints [rad], in the order of the model; after closing on return.
+        squeezed: (c, j) command [rad].
 
     Returns:
-        (c, 2 + d): shift of the object by closing (m), sum of normal forces (N), and the farthest it has been from
-        there up to each direction (m), up to when it was given up.
+        (c, 2 + d): shift of the object by closing [m], sum of normal forces [N], and the farthest it has been from
+        there up to each direction [m], up to when it was given up.
     """
     count, joints = opened.shape
     result, best = np.zeros((count, 2 + len(directions))), np.full(ranking.wanted, -np.inf)
@@ -171,7 +171,7 @@ def _begin(state, wrist, opened):
 
 @native
 def _close(model, steps, opened, squeezed, state, scratch):
-    """Moves the command from open to squeezed and settles; returns the sum of normal forces (N)."""
+    """Moves the command from open to squeezed and settles; returns the sum of normal forces [N]."""
     force = 0.0
     for step in range(steps.closing + steps.settling):
         share = min(1.0, (step + 1) / steps.closing)
@@ -183,8 +183,8 @@ def _close(model, steps, opened, squeezed, state, scratch):
 
 @native
 def _load(model, steps, load, directions, start, settled, limit, state, scratch, farthest):
-    """The weight along each direction in turn, until the object is `limit` (m) from the settled place; `farthest` (d,)
-    gets the farthest it has been (m), which is returned, too."""
+    """The weight along each direction in turn, until the object is `limit` [m] from the settled place; `farthest` (d,)
+    gets the farthest it has been [m], which is returned, too."""
     far = 0.0
     for d in range(len(directions)):
         for _ in range(steps):
@@ -202,7 +202,7 @@ def _load(model, steps, load, directions, start, settled, limit, state, scratch,
 
 @native
 def _moved(wrist, other):
-    """Distance (m) of the object's origin between two poses of the wrist, seen from the wrist."""
+    """Distance [m] of the object's origin between two poses of the wrist, seen from the wrist."""
     square = 0.0
     for i in range(3):
         square += (_origin(wrist, i) - _origin(other, i)) ** 2
@@ -211,13 +211,13 @@ def _moved(wrist, other):
 
 @native
 def _origin(wrist, axis):
-    """Position (m) of the object's origin in the wrist's frame, along one axis."""
+    """Position [m] of the object's origin in the wrist's frame, along one axis."""
     return -(wrist[0, axis] * wrist[0, 3] + wrist[1, axis] * wrist[1, 3] + wrist[2, axis] * wrist[2, 3])
 
 
 @native
 def _relax(model, state, scratch):
-    """One step of descent of all forces; returns the sum of normal forces (N)."""
+    """One step of descent of all forces; returns the sum of normal forces [N]."""
     hand, drives, joints, command, speed = model.hand, model.drives, state.joints, state.command, state.speed
     poses, wrench, gradient = scratch.poses, scratch.wrench, scratch.gradient
     forward(hand, state.wrist, joints, 0.0, scratch.angles, poses)

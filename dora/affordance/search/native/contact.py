@@ -14,9 +14,9 @@ from dora.affordance.search.native.field import coarse, distance_to
 from dora.affordance.search.native.hand import SMALL, point_of, push
 
 STIFFNESS = 4e3
-"""Of the contact of one sphere, across and along the surface (N/m); grips overlap by millimetres then."""
+"""Of the contact of one sphere, across and along the surface [N/m]; grips overlap by millimetres then."""
 APPROACH = 6e-3
-"""Distance (m) that a sphere comes nearer to the object in one step at most; those far away wait."""
+"""Distance [m] that a sphere comes nearer to the object in one step at most; those far away wait."""
 
 
 class Contacts(NamedTuple):
@@ -31,7 +31,7 @@ class Contacts(NamedTuple):
 
 @native
 def touch(hand, field, friction, contacts, poses, wrench):
-    """Contacts of all spheres with the object: their forces go to the wrench; returns the sum of normal forces (N) and
+    """Contacts of all spheres with the object: their forces go to the wrench; returns the sum of normal forces [N] and
     the number of contacts."""
     body_of, centers, radii = hand.sphere_body, hand.sphere_local, hand.sphere_radius
     wait, touching = contacts.wait, contacts.touching
@@ -65,7 +65,7 @@ def touch(hand, field, friction, contacts, poses, wrench):
 
 @inlined
 def _push_out(poses, body, s, n, normal, friction, local, anchor, wrench):
-    """A contact's normal force (N) and Coulomb friction, whose anchor follows when it slides."""
+    """A contact's normal force [N] and Coulomb friction, whose anchor follows when it slides."""
     here = point_of(poses, body, local, s)
     slip = (here[0] - anchor[s, 0], here[1] - anchor[s, 1], here[2] - anchor[s, 2])
     along = slip[0] * n[0] + slip[1] * n[1] + slip[2] * n[2]

@@ -234,7 +234,7 @@ def sphere_terms(hand, field, weights, plane, poses, terms, wrench):
 
 @native
 def limits(hand, weight, angles, gradient):
-    """limits: angles beyond their limits (rad)."""
+    """limits: angles beyond their limits [rad]."""
     total = 0.0
     for joint in range(len(angles)):
         above, below = angles[joint] - hand.upper[joint], hand.lower[joint] - angles[joint]

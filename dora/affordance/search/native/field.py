@@ -10,7 +10,7 @@ from dora.affordance.search.native.compiling import inlined, native
 
 
 class FieldArrays(NamedTuple):
-    """Arrays of `SignedDistanceField`: all channels, distance, nodes per axis, first node, nodes per m, cull (m)."""
+    """Arrays of `SignedDistanceField`: all channels, distance, nodes per axis, first node, nodes per m, cull [m]."""
 
     table: np.ndarray
     distance: np.ndarray
@@ -28,7 +28,7 @@ def _nearest(position, lower, inverse, count):
 
 @inlined
 def coarse(field, point):
-    """Distance (m) at the node nearest to a point."""
+    """Distance [m] at the node nearest to a point."""
     i = _nearest(point[0], field.lower[0], field.inverse, field.shape[0])
     j = _nearest(point[1], field.lower[1], field.inverse, field.shape[1])
     k = _nearest(point[2], field.lower[2], field.inverse, field.shape[2])
@@ -37,7 +37,7 @@ def coarse(field, point):
 
 @inlined
 def _along(position, lower, inverse, count):
-    """Along one axis: first node of the cell, share of the cell passed, distance (m) beyond the grid."""
+    """Along one axis: first node of the cell, share of the cell passed, distance [m] beyond the grid."""
     place = (position - lower) * inverse
     inside = min(max(place, 0.0), count - 1.0)
     base = min(int(inside), count - 2)
@@ -46,7 +46,7 @@ def _along(position, lower, inverse, count):
 
 @native
 def sample(field, table, point, value, slope):
-    """As `SignedDistanceField.sample`: interpolated channels of a table and their derivatives (per m)."""
+    """As `SignedDistanceField.sample`: interpolated channels of a table and their derivatives [1/m]."""
     i, x, outside_x = _along(point[0], field.lower[0], field.inverse, field.shape[0])
     j, y, outside_y = _along(point[1], field.lower[1], field.inverse, field.shape[1])
     k, z, outside_z = _along(point[2], field.lower[2], field.inverse, field.shape[2])
@@ -80,7 +80,7 @@ def sample(field, table, point, value, slope):
 
 @inlined
 def distance_to(field, point):
-    """Interpolated distance (m) and its derivative: `sample` of the first channel alone."""
+    """Interpolated distance [m] and its derivative: `sample` of the first channel alone."""
     i, x, outside_x = _along(point[0], field.lower[0], field.inverse, field.shape[0])
     j, y, outside_y = _along(point[1], field.lower[1], field.inverse, field.shape[1])
     k, z, outside_z = _along(point[2], field.lower[2], field.inverse, field.shape[2])

@@ -8,10 +8,10 @@ import numpy as np
 from dora.affordance.search.native.compiling import inlined, native
 
 SMALL = 1e-9
-"""Length (m) below which a direction is not divided by it."""
+"""Length [m] below which a direction is not divided by it."""
 
 NO_TURN = 1e-12
-"""Angle (rad) of a step that does not turn."""
+"""Angle [rad] of a step that does not turn."""
 
 
 class HandArrays(NamedTuple):
@@ -66,7 +66,7 @@ def forward(hand, wrist, joints, share, angles, poses):
 
 @inlined
 def point_of(poses, body, local, index):
-    """A point of a body (m) in the frame of the poses."""
+    """A point of a body [m] in the frame of the poses."""
     x, y, z = local[index, 0], local[index, 1], local[index, 2]
     return (
         poses[body, 0, 0] * x + poses[body, 0, 1] * y + poses[body, 0, 2] * z + poses[body, 0, 3],
@@ -92,7 +92,7 @@ def push(wrench, body, point, force):
 
 @native
 def self_penetration(hand, weight, stiffness, poses, ends, wrench):
-    """Sum of overlaps (m); capsules part with a force of `weight` and of `stiffness` times the overlap.
+    """Sum of overlaps [m]; capsules part with a force of `weight` and of `stiffness` times the overlap.
 
     `ends` (2 capsules, 3) is room for the ends of the capsules' axes.
     """
@@ -112,7 +112,7 @@ def self_penetration(hand, weight, stiffness, poses, ends, wrench):
 
 @native
 def _overlap(radius, body, weight, stiffness, a, b, ends, wrench):
-    """Overlap (m) of two capsules, and the forces that part them."""
+    """Overlap [m] of two capsules, and the forces that part them."""
     uu = vv = ww = uv = uw = vw = 0.0
     for i in range(3):
         u, v = ends[2 * a + 1, i] - ends[2 * a, i], ends[2 * b + 1, i] - ends[2 * b, i]
@@ -174,7 +174,7 @@ def pull_back(hand, poses, wrench, gradient):
 
 @native
 def turn(wrist, arm, rotation):
-    """Turns the axes of a pose by a rotation vector (rad) about the point that lies at its origin less `arm` (m)."""
+    """Turns the axes of a pose by a rotation vector [rad] about the point that lies at its origin less `arm` [m]."""
     angle = math.sqrt(rotation[0] ** 2 + rotation[1] ** 2 + rotation[2] ** 2)
     if angle < NO_TURN:
         return
