@@ -13,7 +13,7 @@ from commands import call, load_command
 
 from dora.affordance.bundled_sets import bundled_path
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.protocol import STANDARD
+from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.search.optimise import Settings
 from dora.progress import PhaseProgress
@@ -120,7 +120,7 @@ def test_validity_is_that_of_the_simulation(monkeypatch: pytest.MonkeyPatch):
     obj, robot = load_object("cube"), load_robot("diana7_hit")
     seen = {}
 
-    def judge(candidates, obj, robot, protocol, progress) -> Validation:
+    def judge(candidates, obj, robot, test_settings, progress) -> Validation:
         progress(len(candidates), len(candidates))
         seen["found"] = candidates
         passed = torch.arange(len(candidates)) % 2
@@ -131,7 +131,7 @@ def test_validity_is_that_of_the_simulation(monkeypatch: pytest.MonkeyPatch):
             part_force=torch.zeros(len(candidates), 6), label_force=torch.zeros(len(candidates), 1),
             contacts=candidates.contacts, contact_finger=candidates.contact_finger,
             candidate_penetration=zeros + 0.003 * (torch.arange(len(candidates)) == 3),
-            self_penetration=zeros, protocol=protocol,
+            self_penetration=zeros, test_settings=test_settings,
         )  # fmt: skip
 
     monkeypatch.setattr(grasps, "validate", judge)
@@ -146,7 +146,9 @@ def test_validity_is_that_of_the_simulation(monkeypatch: pytest.MonkeyPatch):
     assert report["valid_per_second"] == pytest.approx(2 / seconds)
 
 
-def at_handle_and_body(candidates: GraspCandidates, robot: object, protocol: object, progress: object) -> Validation:
+def at_handle_and_body(
+    candidates: GraspCandidates, robot: object, test_settings: object, progress: object
+) -> Validation:
     """A verdict by which grasps in turn close upon handle and body, whatever they touched before; two of them slip."""
     jug, count = load_object("jug"), len(candidates)
     by_handle = torch.arange(count) % 2 == 0
@@ -162,7 +164,7 @@ def at_handle_and_body(candidates: GraspCandidates, robot: object, protocol: obj
         reason=reason, displacement=zeros, closing_shift=zeros, penetration=zeros,
         part_force=torch.zeros(count, 6), label_force=force,
         contacts=places[by_handle.long()][:, None], contact_finger=torch.full((count, 1), 2),
-        candidate_penetration=zeros, self_penetration=zeros, protocol=STANDARD,
+        candidate_penetration=zeros, self_penetration=zeros, test_settings=STANDARD,
     )  # fmt: skip
 
 

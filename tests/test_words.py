@@ -15,7 +15,7 @@ FEWEST_WORDS = 4
 """Words of a first line that says what lives in a module."""
 UNIT = r"(?:m|mm|cm|km|rad|deg|kg|g|s|ms|us|N|Hz|J|W|pixels|points|kg/m\^3)(?:\^\d)?"
 PHRASE = re.compile(rf"(?:1/)?{UNIT}(?:[ /*]{UNIT})*|per {UNIT}")
-PARENTHESIS = re.compile(r"(?<![\w\]`])\(([^()]*)\)")
+PARENTHESIS = re.compile(r"(?<![\w\]`/])\(([^()]*)\)")
 CONSTANT = re.compile(r"_?[A-Z][A-Z0-9_]*")
 
 

@@ -28,7 +28,7 @@ class FaceLabels:
     Attributes:
         names: of the regions, each with at least one face.
         index: (f,) index into `names`.
-        target: name of the region that a task wants held.
+        target: name of the region that a task wants inside.
     """
 
     names: tuple[str, ...]
@@ -133,14 +133,14 @@ def _from_yaml(path: Path, centers: np.ndarray) -> FaceLabels:
     names = np.full(len(centers), str(content.get("rest", WHOLE)), dtype=object)
     free = np.ones(len(centers), bool)
     for name, shape in content["regions"].items():
-        held = _inside(path, str(name), shape, centers)
-        if not held.any():
+        inside = _inside(path, str(name), shape, centers)
+        if not inside.any():
             raise InputError(
                 f"region {name!r} of {path} holds no face; the mesh reaches from {centers.min(0).round(4).tolist()} "
                 f"to {centers.max(0).round(4).tolist()} in the coordinates of its file."
             )
-        names[held & free] = str(name)
-        free &= ~held
+        names[inside & free] = str(name)
+        free &= ~inside
     return FaceLabels.from_names(names.tolist(), content.get("target"), str(path))
 
 

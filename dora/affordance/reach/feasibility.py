@@ -43,7 +43,7 @@ from dora.robot.motion.height_bounds import ArmHeightBounds, HandHeightBounds
 from dora.robot.motion.inverse_kinematics import InverseKinematics
 from dora.robot.motion.planning import plan
 
-CLOSINGS = (0.0, 0.5, 1.0)
+CLOSING_SHARES = (0.0, 0.5, 1.0)
 """Shares of the way from the opened hand to contact at which the hand's height over the table is taken."""
 IDENTITY = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 """Pose of a robot's base at the world's origin: position [m], quaternion wxyz."""
@@ -224,7 +224,7 @@ class Reach:
         """Lowest height [m] of the hand above the table on the approach and while it closes."""
         heights = []
         normal = (matrix_from_quaternion(goals.quaternion).transpose(1, 2) @ self._normal)[:, None]
-        for share in CLOSINGS:
+        for share in CLOSING_SHARES:
             joints = torch.lerp(candidates.pregrasp, candidates.joints, share)
             spheres = self._hand.spheres(joints).repeat(len(goals.position) // len(candidates), 1, 1)
             heights.append(((spheres * normal).sum(-1) - self._hand.radii).amin(-1))

@@ -37,7 +37,7 @@ AZIMUTHS, ELEVATIONS = 8, (0.15, 0.55)
 """Number of azimuths and the elevations [rad] from which a grasp may be seen."""
 PREVIEW = 64
 """Width and height of the views by which the best one is chosen [pixels]."""
-GRIPPED = 0.03
+CONTACT_NEIGHBOURHOOD = 0.03
 """Distance to a contact point up to which a surface counts as held [m]."""
 MILLIMETRES = 1000.0
 """Per metre."""
@@ -68,11 +68,11 @@ def picture_grasps(
     The hand is in its posture at contact, seen from where it and what it holds are seen best.
     """
     mesh, panels = coloured(obj), []
-    vertices, faces, *_ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, GRIPPED)
+    vertices, faces, *_ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, CONTACT_NEIGHBOURHOOD)
     cut = trimesh.Trimesh(vertices, faces, process=False)
     model = HandMesh(robot)
     for row, hand in enumerate(model.posed(candidates.position, candidates.quaternion, candidates.joints)):
-        camera = best_view(cut, hand, _held(candidates, row, cut.triangles_center), model.fingers)
+        camera = best_view(cut, hand, _near_contacts(candidates, row, cut.triangles_center), model.fingers)
         view = render([mesh, hand], camera, TILE, TILE)
         panels.append(Panel(view, caption(candidates, row)))
     write_sheet(panels, path, min(columns, len(panels)), legend_of(obj.labels), obj.name)
@@ -123,30 +123,30 @@ def caption(candidates: GraspCandidates, row: int) -> str:
 
 
 def best_view(
-    mesh: trimesh.Trimesh, hand: trimesh.Trimesh, held: Bool[np.ndarray, " f"], fingers: Bool[np.ndarray, " h"]
+    mesh: trimesh.Trimesh, hand: trimesh.Trimesh, touched: Bool[np.ndarray, " f"], fingers: Bool[np.ndarray, " h"]
 ) -> Camera:
     """The camera, of those around, that sees most of an object's held faces and most of the hand's fingers.
 
     Args:
         mesh: the object.
         hand: in its posture.
-        held: which faces of the object count.
+        touched: which faces of the object count.
         fingers: which faces of the hand count.
     """
-    grip = np.concatenate([held, np.zeros(len(fingers) + 1, bool)])
-    grasping = np.concatenate([np.zeros(len(held), bool), fingers, [False]])
+    part = np.concatenate([touched, np.zeros(len(fingers) + 1, bool)])
+    finger = np.concatenate([np.zeros(len(touched), bool), fingers, [False]])
 
     def worth(camera: Camera) -> int:
         found = seen([mesh, hand], camera, PREVIEW, PREVIEW)
-        return int(grip[found].sum()) * int(grasping[found].sum())
+        return int(part[found].sum()) * int(finger[found].sum())
 
     azimuths = 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
     return max((Camera.around([mesh, hand], float(a), e) for a in azimuths for e in ELEVATIONS), key=worth)
 
 
-def _held(candidates: GraspCandidates, row: int, centres: np.ndarray) -> Bool[np.ndarray, " f"]:
+def _near_contacts(candidates: GraspCandidates, row: int, centres: np.ndarray) -> Bool[np.ndarray, " f"]:
     """Which faces, of given centres (f, 3) [m], are near a contact of a candidate; all if it has none."""
     points = candidates.contacts[row][candidates.contact_finger[row] > 0].numpy()
     if not len(points):
         return np.ones(len(centres), bool)
-    return np.linalg.norm(centres[:, None] - points, axis=-1).min(1) < GRIPPED
+    return np.linalg.norm(centres[:, None] - points, axis=-1).min(1) < CONTACT_NEIGHBOURHOOD

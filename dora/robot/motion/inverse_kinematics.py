@@ -37,9 +37,9 @@ DAMPING_GAIN = 0.02
 """Growth of lambda^2 with the squared error (m^2 and rad^2 together)."""
 LARGEST_STEP = 0.6
 """Largest change of a joint in one iteration [rad]."""
-PULLED = 4
-"""Iterations that also pull towards the start posture in the null space."""
-PULL = 0.2
+NULLSPACE_ITERATIONS = 4
+"""Iterations that also nullspace_gain towards the start posture in the null space."""
+NULLSPACE_GAIN = 0.2
 """Share of the way to the start posture in such an iteration."""
 METRES_PER_RADIAN = 0.3
 """What a radian of orientation counts in the search for seeds [m/rad]."""
@@ -57,7 +57,7 @@ MANIPULABILITY_SCALE = 0.02
 """sqrt(det(J J^T)) below which a solution becomes dear [m^3 / rad^3]."""
 MANIPULABILITY_COST = 1.0
 """Cost of a singular posture, in radians of distance from the start posture."""
-LAST = 1e3
+UNSOLVED_COST = 1e3
 """More than any solution's cost [rad]: puts what is not solved last."""
 NUMBERS = {
     "position_tolerance": POSITION_TOLERANCE,
@@ -65,7 +65,7 @@ NUMBERS = {
     "limit_margin": LIMIT_MARGIN,
     "damping": (DAMPING_FLOOR, DAMPING_GAIN),
     "largest_step": LARGEST_STEP,
-    "pull": (PULLED, PULL),
+    "pull": (NULLSPACE_ITERATIONS, NULLSPACE_GAIN),
     "metres_per_radian": (METRES_PER_RADIAN, METRES_PER_JOINT_RADIAN),
     "table_size": TABLE_SIZE,
     "margin": (MARGIN_SCALE, MARGIN_COST),
@@ -145,7 +145,7 @@ class InverseKinematics:
         away, turn = error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1)
         solved = (away < POSITION_TOLERANCE) & (turn < ANGLE_TOLERANCE)
         cost = self._cost(q, manipulability)
-        order = torch.where(solved, cost, LAST + away + turn).reshape(n, seeds).argsort(dim=-1, stable=True)
+        order = torch.where(solved, cost, UNSOLVED_COST + away + turn).reshape(n, seeds).argsort(dim=-1, stable=True)
         flat = (order + seeds * torch.arange(n)[:, None]).reshape(-1)
         return Solutions(
             q[flat].reshape(n, seeds, dof),
@@ -166,7 +166,7 @@ class InverseKinematics:
         rotation = matrix_from_quaternion(quaternion)
         postures, solved = [], []
         for place, turn in zip(position.unbind(1), rotation.unbind(1), strict=True):
-            q, error, _ = self._iterate(q, place, turn, iterations, pulled=0)
+            q, error, _ = self._iterate(q, place, turn, iterations, nullspace_iterations=0)
             postures.append(q)
             solved.append(
                 (error[:, :3].norm(dim=-1) < POSITION_TOLERANCE) & (error[:, 3:].norm(dim=-1) < ANGLE_TOLERANCE)
@@ -202,7 +202,12 @@ class InverseKinematics:
         return q.clamp(self.lower, self.upper)
 
     def _iterate(
-        self, q: Tensor, position: Tensor, rotation: Tensor, iterations: int, pulled: int = PULLED
+        self,
+        q: Tensor,
+        position: Tensor,
+        rotation: Tensor,
+        iterations: int,
+        nullspace_iterations: int = NULLSPACE_ITERATIONS,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Damped steps until all rows are within half the tolerances; (q, error (n, 6), manipulability (n,))."""
         out, left = q.clone(), torch.arange(len(q))
@@ -225,18 +230,18 @@ class InverseKinematics:
                     break
                 q, error, jacobian, left = q[keep], error[keep], jacobian[keep], left[keep]
                 position, rotation = position[keep], rotation[keep]
-            q = self._step(q, error, jacobian, PULL if i < pulled else 0.0)
+            q = self._step(q, error, jacobian, NULLSPACE_GAIN if i < nullspace_iterations else 0.0)
         return out, final, manipulability
 
-    def _step(self, q: Tensor, error: Tensor, jacobian: Tensor, pull: float) -> Tensor:
+    def _step(self, q: Tensor, error: Tensor, jacobian: Tensor, nullspace_gain: float) -> Tensor:
         gradient = (error.unsqueeze(-2) @ jacobian).squeeze(-2)
         stuck = ((q >= self.upper) & (gradient > 0)) | ((q <= self.lower) & (gradient < 0))
         jacobian = jacobian * ~stuck[:, None]
         damping = DAMPING_FLOOR + DAMPING_GAIN * error.square().sum(-1)
         goal = error.unsqueeze(-1)
-        rest = pull * (self.start - q)
+        rest = nullspace_gain * (self.start - q)
         rest[:, 0] = 0.0  # the azimuth decides it
-        if pull:
+        if nullspace_gain:
             goal = goal - jacobian @ rest.unsqueeze(-1)
         transposed = jacobian.transpose(1, 2)
         product = torch.baddbmm(damping[:, None, None] * self._identity, jacobian, transposed)

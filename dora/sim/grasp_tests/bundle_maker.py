@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dora.affordance.bundled_sets import ROBOT, bundled_path
 from dora.affordance.candidates import GraspCandidates, concatenate
-from dora.affordance.hand.protocol import STANDARD
+from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.approach_directions import free_approaches
@@ -137,7 +137,7 @@ class SetMaker:
         if self.on_table:
             score = rank(candidates, self.obj, self.robot, progress=report)
         else:
-            score = holds(candidates, self.obj, self.robot, report)
+            score = rank_by_shaking(candidates, self.obj, self.robot, report)
         order = torch.argsort(score, descending=True, stable=True)
         return replace(candidates, score=score).select(order)
 
@@ -146,7 +146,7 @@ class SetMaker:
         return self.phases.phase(f"{self.obj.name}: {name}", "candidates", scale)
 
 
-def holds(
+def rank_by_shaking(
     candidates: GraspCandidates,
     obj: AffordanceObject,
     robot: RobotDescription,

@@ -14,8 +14,8 @@ from jaxtyping import Int
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.protocol import STANDARD, Protocol
-from dora.affordance.maps.confusion import Agreement, clearly_held
+from dora.affordance.hand.grasp_test_settings import STANDARD, GraspTestSettings
+from dora.affordance.maps.confusion import Confusion, clearly_dominant
 from dora.affordance.maps.voting import vote
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.search.cache import map_of
@@ -80,7 +80,7 @@ def generate(
     phases: PhaseProgress,
     simulate: bool = True,
     settings: Settings | None = None,
-    protocol: Protocol = STANDARD,
+    test_settings: GraspTestSettings = STANDARD,
     name: str = "grasps",
 ) -> Generated:
     """Search for grasps and judge them.
@@ -94,7 +94,7 @@ def generate(
         phases: where progress is shown.
         simulate: whether to validate in SAPIEN; otherwise penetration and touch decide.
         settings: of the search.
-        protocol: of the validation.
+        test_settings: of the validation.
         name: of this run, for the progress.
 
     Raises:
@@ -109,13 +109,13 @@ def generate(
     between = time.perf_counter()
     verdict, voting = None, {}
     if simulate:
-        verdict = validate(found, obj, robot, protocol, progress=phases.phase(f"{name}: simulation", "candidates"))
+        verdict = validate(found, obj, robot, test_settings, progress=phases.phase(f"{name}: simulation", "candidates"))
         valid, voting = verdict.valid, votes(found, verdict, obj)
         found = replace(found, grasp_class=_classes(found, voting[CLOSED], obj))
     else:
-        valid = (found.penetration <= protocol.penetration) & (found.contact_finger > 0).any(1)
+        valid = (found.penetration <= test_settings.penetration) & (found.contact_finger > 0).any(1)
     end = time.perf_counter()
-    judged = repr(protocol) if simulate else None
+    judged = repr(test_settings) if simulate else None
     origin = {"search": found.settings, "region": region, "seed": seed, "protocol": judged}
     candidates = replace(found, valid=valid, settings=json.dumps(origin))
     return Generated(candidates, num, region, seed, between - start, end - between, verdict, voting)
@@ -201,7 +201,7 @@ def voting_summary(several: Iterable[Generated], obj: AffordanceObject) -> dict[
     """
     simulated = [(g.verdict, g.voting) for g in several if g.verdict is not None]
     force = torch.cat([verdict.label_force for verdict, _ in simulated])
-    pressed, clear = force.sum(1) > 0, clearly_held(force)
+    pressed, clear = force.sum(1) > 0, clearly_dominant(force)
     valid = torch.cat([verdict.valid for verdict, _ in simulated])
     voted = {kind: torch.cat([votes[kind] for _, votes in simulated]) for kind in (CANDIDATE, CLOSED)}
     groups = {"all": pressed, "clear": clear, "valid": pressed & valid, "valid_clear": clear & valid}
@@ -209,11 +209,11 @@ def voting_summary(several: Iterable[Generated], obj: AffordanceObject) -> dict[
     for group, rows in groups.items():
         found[group] = {"grasps": int(rows.sum())}
         for kind, choice in voted.items():
-            agreement = Agreement.of(obj.labels, choice[rows], force[rows].argmax(1))
+            confusion = Confusion.of(obj.labels, choice[rows], force[rows].argmax(1))
             found[group][kind] = {
-                "balanced_accuracy": agreement.balanced_accuracy,
-                "recall": agreement.recall,
-                "confusion": agreement.confusion.tolist(),
+                "balanced_accuracy": confusion.balanced_accuracy,
+                "recall": confusion.recall,
+                "confusion": confusion.counts.tolist(),
             }
     return found
 

@@ -25,7 +25,7 @@ class HandContacts:
     depth: float
 
     @property
-    def held(self) -> bool:
+    def in_contact(self) -> bool:
         """Whether any point carries a force."""
         return bool((self.force > 0).any())
 

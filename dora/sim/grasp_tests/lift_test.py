@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.protocol import STANDARD
+from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.errors import InputError
 from dora.geometry.rotations import (
@@ -103,43 +103,43 @@ class LiftTest:
         self.execution, self.physics = execution, physics
         self.rest = np.array([0.0, 0.0, obj.support]), np.array(obj.rest)
         gravity = (0.0, 0.0, -STANDARD.gravity)
-        self.rig = GraspTestScene(obj, robot, STANDARD.friction, physics, gravity, carriage=True, table=True)
+        self.scene = GraspTestScene(obj, robot, STANDARD.friction, physics, gravity, carriage=True, table=True)
 
     def __call__(self, lift: Lift) -> bool:
         """Reach, close, lift and hold."""
-        e, rig = self.execution, self.rig
+        e, scene = self.execution, self.scene
         turn = matrix_from_quaternion(torch.tensor(lift.quaternion)).numpy()
         before, above = -e.standoff * lift.approach @ turn, np.array([0.0, 0.0, e.height]) @ turn
         grasp = np.zeros(3)
-        rig.stage(*self.rest, lift.mass, lift.friction)
-        rig.hand.reset(lift.pregrasp, sapien.Pose(lift.position.tolist(), lift.quaternion.tolist()), before)
+        scene.stage(*self.rest, lift.mass, lift.friction)
+        scene.hand.reset(lift.pregrasp, sapien.Pose(lift.position.tolist(), lift.quaternion.tolist()), before)
         if not self._move(before, grasp):
             return False
         self._close(lift)
-        rig.run(self.physics.steps(e.settling_time))
+        scene.run(self.physics.steps(e.settling_time))
         self._move(grasp, above)
-        rig.run(self.physics.steps(e.hold))
+        scene.run(self.physics.steps(e.hold))
         return self._succeeded()
 
     def _move(self, begin: np.ndarray, end: np.ndarray) -> bool:
         """Palm along a straight line, offsets (3,) from the grasp in its frame [m]; whether it got there."""
         commands = max(1, round(float(np.linalg.norm(end - begin)) / self.execution.speed * COMMANDS))
         for command in range(1, commands + 1):
-            self.rig.hand.move((begin + (end - begin) * command / commands).tolist())
-            self.rig.run(self.physics.steps(1 / COMMANDS))
-        return self.rig.hand.lag < BLOCKED
+            self.scene.hand.move((begin + (end - begin) * command / commands).tolist())
+            self.scene.run(self.physics.steps(1 / COMMANDS))
+        return self.scene.hand.lag < BLOCKED
 
     def _close(self, lift: Lift) -> None:
         commands = max(1, round(self.execution.closing_time * COMMANDS))
         for command in range(1, commands + 1):
-            self.rig.hand.command(lift.pregrasp + (lift.grasp - lift.pregrasp) * command / commands)
-            self.rig.run(self.physics.steps(1 / COMMANDS))
+            self.scene.hand.command(lift.pregrasp + (lift.grasp - lift.pregrasp) * command / commands)
+            self.scene.run(self.physics.steps(1 / COMMANDS))
 
     def _succeeded(self) -> bool:
-        pose, grip = self.rig.pose, self.rig.read_contacts()
+        pose, contacts = self.scene.pose, self.scene.read_contacts()
         cosine = min(1.0, abs(float(np.dot(pose.q, self.rest[1]))))
         up = float(pose.p[2] - self.rest[0][2]) > self.execution.lifted
-        return up and grip.held and bool(2 * np.arccos(cosine) < self.execution.turn)
+        return up and contacts.in_contact and bool(2 * np.arccos(cosine) < self.execution.turn)
 
 
 def rank(

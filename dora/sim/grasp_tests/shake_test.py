@@ -1,8 +1,8 @@
 """Validation of grasp candidates by simulation: the hand closes, then gravity pulls in six directions in turn.
 
-docs/validation.md says what is done and why; the numbers are in `dora.affordance.hand.protocol`. Candidates are shared
-out over processes. Each process simulates one after the other in a scene of its own, since a PhysX step of several
-hands takes as long as the steps of each; a candidate that fails makes room for the next at once.
+docs/validation.md describes the test; `dora.affordance.hand.grasp_test_settings` has its numbers. Candidates are
+distributed over processes. Each process simulates one candidate after the other in a scene of its own: a PhysX step of
+several hands takes as long as one step for each. A candidate that fails ends early.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.protocol import DIRECTIONS, STANDARD, Protocol
+from dora.affordance.hand.grasp_test_settings import DIRECTIONS, STANDARD, GraspTestSettings
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.search.cache import map_of
 from dora.errors import InputError
@@ -24,11 +24,11 @@ from dora.robot import RobotDescription
 from dora.sim.grasp_tests.hand_contacts import HandContacts
 from dora.sim.grasp_tests.test_scene import GraspTestScene, Physics
 
-LOOK = 0.05
+DISPLACEMENT_INTERVAL = 0.05
 """Time between measurements of the displacement [s]."""
-TOUCH = 0.25
+CONTACT_INTERVAL = 0.25
 """Time between readings of the contacts [s]; reading takes as long as a physics step."""
-THROWN = 0.05
+THROWN_SHIFT = 0.05
 """Shift by closing at which a test ends: there is nothing left to hold [m]."""
 
 
@@ -90,7 +90,7 @@ class Validation:
         contact_finger: (c, k) what presses there: 0 nothing, 1 palm, 2 thumb, ... 6 pinky.
         candidate_penetration: (c,) overlap of hand and object at the candidate, from the candidates [m].
         self_penetration: (c,) overlap of the hand with itself at the candidate, from the candidates [m].
-        protocol: what was done.
+        test_settings: what was done.
     """
 
     reason: Int[Tensor, " c"]
@@ -103,7 +103,7 @@ class Validation:
     contact_finger: Int[Tensor, "c k"]
     candidate_penetration: Float[Tensor, " c"]
     self_penetration: Float[Tensor, " c"]
-    protocol: Protocol
+    test_settings: GraspTestSettings
 
     @property
     def passed(self) -> Bool[Tensor, " c"]:
@@ -113,13 +113,13 @@ class Validation:
     @property
     def valid(self) -> Bool[Tensor, " c"]:
         """Passed, with no more overlap at the candidate than the protocol allows."""
-        return self.passed & (self.candidate_penetration <= self.protocol.penetration)
+        return self.passed & (self.candidate_penetration <= self.test_settings.penetration)
 
     @property
     def strict(self) -> Bool[Tensor, " c"]:
         """Valid, with no more self-penetration and no more shift by closing than the protocol's strict limits."""
-        tidy = self.self_penetration < self.protocol.strict_self_penetration
-        return self.valid & tidy & (self.closing_shift < self.protocol.strict_shift)
+        tidy = self.self_penetration < self.test_settings.strict_self_penetration
+        return self.valid & tidy & (self.closing_shift < self.test_settings.strict_shift)
 
     @property
     def touched(self) -> Bool[Tensor, "c parts"]:
@@ -127,7 +127,7 @@ class Validation:
         return self.part_force > 0
 
     @property
-    def held(self) -> Int[Tensor, " c"]:
+    def dominant_region(self) -> Int[Tensor, " c"]:
         """Index of the region that carried most force after closing; -1 if none did."""
         return torch.where(self.label_force.sum(1) > 0, self.label_force.argmax(1), -1)
 
@@ -135,61 +135,63 @@ class Validation:
 class ShakeTest:
     """Simulates one candidate after the other; arguments as of `validate`."""
 
-    def __init__(self, obj: AffordanceObject, robot: RobotDescription, protocol: Protocol, physics: Physics):
-        self.protocol, self.physics = protocol, physics
-        self.weight = obj.mass * protocol.gravity
-        self.rig = GraspTestScene(obj, robot, protocol.friction, physics)
+    def __init__(
+        self, obj: AffordanceObject, robot: RobotDescription, test_settings: GraspTestSettings, physics: Physics
+    ):
+        self.test_settings, self.physics = test_settings, physics
+        self.weight = obj.mass * test_settings.gravity
+        self.scene = GraspTestScene(obj, robot, test_settings.friction, physics)
 
     def __call__(self, case: Case) -> Trial:
         """Closes the hand and, if the object is still there, tries all directions."""
-        self.rig.place(case.position, case.quaternion)
-        self.rig.hand.reset(case.pregrasp)
+        self.scene.place(case.position, case.quaternion)
+        self.scene.hand.reset(case.pregrasp)
         shift = self._close(case)
-        if not shift < THROWN:
+        if not shift < THROWN_SHIFT:
             return Trial(Reason.THROWN, 0.0, shift, 0.0, None)
-        touch = self.rig.read_contacts()
+        touch = self.scene.read_contacts()
         reason, displacement, depth = self._shake(case)
         return Trial(reason, displacement, shift, max(touch.depth, depth), touch.in_frame(self.start))
 
     def _close(self, case: Case) -> float:
         """The hand moves from its opened to its squeezing posture; returns the object's shift [m]."""
-        rig, protocol = self.rig, self.protocol
-        steps, look = self.physics.steps(protocol.closing_time), self.physics.steps(LOOK)
-        moving = max(1, round(protocol.ramp * steps))
+        scene, test_settings = self.scene, self.test_settings
+        steps, look = self.physics.steps(test_settings.closing_time), self.physics.steps(DISPLACEMENT_INTERVAL)
+        moving = max(1, round(test_settings.ramp * steps))
         shift, change = 0.0, case.grasp - case.pregrasp
-        rig.damp(protocol.closing_damping)
+        scene.damp(test_settings.closing_damping)
         for step in range(1, steps + 1):
             if step <= moving:
-                rig.hand.command(case.pregrasp + step / moving * change)
-            rig.step()
+                scene.hand.command(case.pregrasp + step / moving * change)
+            scene.step()
             if step % look == 0 or step == steps:
-                shift = float(np.linalg.norm(rig.position - case.position))
-                if not shift < THROWN:
+                shift = float(np.linalg.norm(scene.position - case.position))
+                if not shift < THROWN_SHIFT:
                     break
-        rig.damp(0.0)
-        self.start = rig.pose
+        scene.damp(0.0)
+        self.start = scene.pose
         return shift
 
     def _shake(self, case: Case) -> tuple[Reason, float, float]:
         """Gravity along all directions: how it ended, displacement and penetration [m]."""
-        rig, physics = self.rig, self.physics
+        scene, physics = self.scene, self.physics
         turn = matrix_from_quaternion(torch.tensor(case.quaternion)).numpy()
         origin, farthest, depth = self.start.p, 0.0, 0.0
-        push, step = rig.push, rig.step
-        looks = max(1, round(self.protocol.duration / LOOK))
+        push, step = scene.push, scene.step
+        looks = max(1, round(self.test_settings.duration / DISPLACEMENT_INTERVAL))
         for direction in DIRECTIONS:
             force = (turn @ np.array(direction) * self.weight).astype(np.float32)
             for look in range(1, looks + 1):
-                for _ in range(physics.steps(self.protocol.duration / looks)):
+                for _ in range(physics.steps(self.test_settings.duration / looks)):
                     push(force)
                     step()
-                farthest = max(farthest, float(np.linalg.norm(rig.position - origin)))
-                if not farthest <= self.protocol.displacement:
+                farthest = max(farthest, float(np.linalg.norm(scene.position - origin)))
+                if not farthest <= self.test_settings.displacement:
                     return Reason.SLIPPED, farthest, depth
-                if look % round(TOUCH / LOOK) == 0 or look == looks:
-                    touch = rig.read_contacts()
+                if look % round(CONTACT_INTERVAL / DISPLACEMENT_INTERVAL) == 0 or look == looks:
+                    touch = scene.read_contacts()
                     depth = max(depth, touch.depth)
-            if not touch.held:
+            if not touch.in_contact:
                 return Reason.RELEASED, farthest, depth
         return Reason.PASSED, farthest, depth
 
@@ -198,7 +200,7 @@ def validate(
     candidates: GraspCandidates,
     obj: AffordanceObject,
     robot: RobotDescription,
-    protocol: Protocol = STANDARD,
+    test_settings: GraspTestSettings = STANDARD,
     physics: Physics | None = None,
     processes: int | None = None,
     progress: Progress | None = None,
@@ -212,7 +214,7 @@ def validate(
         candidates: of this object and this robot.
         obj: the object.
         robot: its hand is simulated with the palm held still, without the arm.
-        protocol: what is done.
+        test_settings: what is done.
         physics: how finely.
         processes: number of processes, one per core by default; 1 stays in this process.
         progress: called with the number of candidates done and of all.
@@ -222,7 +224,9 @@ def validate(
         RuntimeError: a simulating process died.
     """
     check_object(candidates, obj)
-    trials = run_cases(ShakeTest, (obj, robot, protocol, physics or Physics()), _cases(candidates), processes, progress)
+    trials = run_cases(
+        ShakeTest, (obj, robot, test_settings, physics or Physics()), _cases(candidates), processes, progress
+    )
     parts = 1 + len(robot.fingers)
     contacts = [trial.touch for trial in trials]
     points, finger = _pressed(contacts)
@@ -238,7 +242,7 @@ def validate(
         contact_finger=finger,
         candidate_penetration=candidates.penetration.cpu(),
         self_penetration=candidates.self_penetration.cpu(),
-        protocol=protocol,
+        test_settings=test_settings,
     )
 
 
