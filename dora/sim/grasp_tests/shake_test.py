@@ -1,4 +1,4 @@
-"""Validation of grasp candidates by simulation: the hand closes, then gravity pulls in six directions in turn.
+"""Validation of grasp candidates by simulation: the hand closes, then gravity acts in six directions in turn.
 
 docs/validation.md describes the test; `dora.affordance.hand.grasp_test_settings` has its numbers. Candidates are
 distributed over processes. Each process simulates one candidate after the other in a scene of its own: a PhysX step of
@@ -25,34 +25,35 @@ from dora.sim.grasp_tests.hand_contacts import HandContacts
 from dora.sim.grasp_tests.test_scene import GraspTestScene, Physics
 
 DISPLACEMENT_INTERVAL = 0.05
-"""Time between measurements of the displacement [s]."""
+"""Time between two measurements of the displacement [s]."""
 CONTACT_INTERVAL = 0.25
-"""Time between readings of the contacts [s]; reading takes as long as a physics step."""
+"""Time between two readings of the contacts, each of which takes as long as a physics step [s]."""
 THROWN_SHIFT = 0.05
-"""Shift by closing at which a test ends: there is nothing left to hold [m]."""
+"""Displacement by closing at which a test ends, because the object is lost [m]."""
 
 
 class Reason(IntEnum):
-    """How a test ended."""
+    """How a grasp test ended."""
 
     PASSED = 0
+    """The hand held the object under all directions."""
     THROWN = 1
-    """Closing moved the object by 5 cm."""
+    """Closing moved the object by `THROWN_SHIFT` or more."""
     SLIPPED = 2
     """The object moved too far under gravity."""
     RELEASED = 3
-    """Nothing of the hand carried the object at the end of a direction."""
+    """No part of the hand carried a contact force at the end of a direction."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One candidate, hand at the world's origin: pose of the object in the hand's frame, commanded joints.
+    """One candidate with the wrist at the world's origin.
 
     Attributes:
-        position: (3,) [m].
-        quaternion: (4,) wxyz.
-        pregrasp: (20,) joints before closing [rad].
-        grasp: (20,) commanded joints of the squeezing hand [rad].
+        position: (3,) object in the wrist frame [m].
+        quaternion: (4,) object in the wrist frame, wxyz.
+        pregrasp: (20,) hand joints before closing [rad].
+        grasp: (20,) commanded hand joints of the squeezing hand [rad].
     """
 
     position: np.ndarray
@@ -63,7 +64,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Trial:
-    """What became of one candidate; as `Validation`, and the contacts after closing in the object frame."""
+    """Result of one candidate; fields as in `Validation`, and the contacts after closing in the object frame."""
 
     reason: Reason
     displacement: float
@@ -74,23 +75,23 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """Results of c candidates.
+    """Results of the grasp test for c candidates.
 
     Attributes:
-        reason: (c,) a `Reason` each.
-        displacement: (c,) farthest the centre of mass was from where closing left it [m].
-        closing_shift: (c,) how far closing moved the centre of mass [m].
-        penetration: (c,) deepest overlap of hand and object in the simulation, at readings from the end of closing
+        reason: (c,) how the test ended, a `Reason` each.
+        displacement: (c,) largest distance of the centre of mass from its place after closing [m].
+        closing_shift: (c,) displacement of the centre of mass by closing [m].
+        penetration: (c,) largest penetration depth of hand and object in the simulation, from the end of closing
             on [m].
-        part_force: (c, parts) contact force after closing on the palm and on each finger: magnitudes of the impulses
-            at the contact points over the time of the step, added up [N].
-        label_force: (c, labels) the same by the region of the object in which the contact points lie [N].
-        contacts: (c, k, 3) contact points that carry force after closing, in the object frame [m]; rows are filled up
+        part_force: (c, parts) contact force on palm and fingers after closing: sum over the contact points of the
+            impulse's magnitude divided by the duration of the step [N].
+        label_force: (c, labels) the same sums by the region of the object in which the contact points lie [N].
+        contacts: (c, k, 3) contact points that carry force after closing, in the object frame [m]; rows are padded
             with zeros.
-        contact_finger: (c, k) what presses there: 0 nothing, 1 palm, 2 thumb, ... 6 pinky.
-        candidate_penetration: (c,) overlap of hand and object at the candidate, from the candidates [m].
-        self_penetration: (c,) overlap of the hand with itself at the candidate, from the candidates [m].
-        test_settings: what was done.
+        contact_finger: (c, k) their contact classes: 0 no contact, 1 palm, 2 thumb, ... 6 pinky.
+        candidate_penetration: (c,) penetration depth of hand and object at the candidate, by geometry [m].
+        self_penetration: (c,) penetration depth between links of the hand at the candidate, by geometry [m].
+        test_settings: settings of the test.
     """
 
     reason: Int[Tensor, " c"]
@@ -107,33 +108,33 @@ class Validation:
 
     @property
     def passed(self) -> Bool[Tensor, " c"]:
-        """Whether the simulated hand held the object."""
+        """(c,) whether the simulated hand held the object under all directions."""
         return self.reason == Reason.PASSED
 
     @property
     def valid(self) -> Bool[Tensor, " c"]:
-        """Passed, with no more overlap at the candidate than the protocol allows."""
+        """(c,) passed, and within the test's limit of the penetration depth at the candidate."""
         return self.passed & (self.candidate_penetration <= self.test_settings.penetration)
 
     @property
     def strict(self) -> Bool[Tensor, " c"]:
-        """Valid, with no more self-penetration and no more shift by closing than the protocol's strict limits."""
+        """(c,) valid, and within the strict limits of self-penetration and of the displacement by closing."""
         tidy = self.self_penetration < self.test_settings.strict_self_penetration
         return self.valid & tidy & (self.closing_shift < self.test_settings.strict_shift)
 
     @property
     def touched(self) -> Bool[Tensor, "c parts"]:
-        """Which of palm and fingers carried force after closing."""
+        """(c, parts) whether palm and fingers carried force after closing."""
         return self.part_force > 0
 
     @property
     def dominant_region(self) -> Int[Tensor, " c"]:
-        """Index of the region that carried most force after closing; -1 if none did."""
+        """(c,) index of the region with the largest contact force after closing; -1 without force."""
         return torch.where(self.label_force.sum(1) > 0, self.label_force.argmax(1), -1)
 
 
 class ShakeTest:
-    """Simulates one candidate after the other; arguments as of `validate`."""
+    """Simulates candidates one after the other in one scene; arguments as for `validate`."""
 
     def __init__(
         self, obj: AffordanceObject, robot: RobotDescription, test_settings: GraspTestSettings, physics: Physics
@@ -143,7 +144,7 @@ class ShakeTest:
         self.scene = GraspTestScene(obj, robot, test_settings.friction, physics)
 
     def __call__(self, case: Case) -> Trial:
-        """Closes the hand and, if the object is still there, tries all directions."""
+        """Closes the hand and, unless the object was thrown, applies gravity along all directions."""
         self.scene.place(case.position, case.quaternion)
         self.scene.hand.reset(case.pregrasp)
         shift = self._close(case)
@@ -154,7 +155,7 @@ class ShakeTest:
         return Trial(reason, displacement, shift, max(touch.depth, depth), touch.in_frame(self.start))
 
     def _close(self, case: Case) -> float:
-        """The hand moves from its opened to its squeezing posture; returns the object's shift [m]."""
+        """Moves the command from the opened to the squeezing posture; returns the object's displacement [m]."""
         scene, test_settings = self.scene, self.test_settings
         steps, look = self.physics.steps(test_settings.closing_time), self.physics.steps(DISPLACEMENT_INTERVAL)
         moving = max(1, round(test_settings.ramp * steps))
@@ -173,7 +174,7 @@ class ShakeTest:
         return shift
 
     def _shake(self, case: Case) -> tuple[Reason, float, float]:
-        """Gravity along all directions: how it ended, displacement and penetration [m]."""
+        """Applies gravity along all directions; returns how it ended, displacement and penetration depth [m]."""
         scene, physics = self.scene, self.physics
         turn = matrix_from_quaternion(torch.tensor(case.quaternion)).numpy()
         origin, farthest, depth = self.start.p, 0.0, 0.0
@@ -207,17 +208,17 @@ def validate(
 ) -> Validation:
     """Tests every candidate in SAPIEN.
 
-    Equal candidates give equal results but for rare borderline cases: PhysX remembers contacts of the grasp before,
-    which changes the last bits.
+    Equal candidates give equal results except in rare borderline cases: PhysX keeps contacts of the grasp before, which
+    changes the last bits.
 
     Args:
-        candidates: of this object and this robot.
+        candidates: c candidates of this object and this robot.
         obj: the object.
-        robot: its hand is simulated with the palm held still, without the arm.
-        test_settings: what is done.
-        physics: how finely.
+        robot: the robot whose hand is simulated with a fixed palm, without the arm.
+        test_settings: settings of the test.
+        physics: resolution of the simulation; the default if None.
         processes: number of processes, one per core by default; 1 stays in this process.
-        progress: called with the number of candidates done and of all.
+        progress: called with the number of candidates done and their total.
 
     Raises:
         InputError: the candidates are of another object.
@@ -247,13 +248,17 @@ def validate(
 
 
 def check_object(candidates: GraspCandidates, obj: AffordanceObject) -> None:
-    """Raises InputError if the candidates are known to be of another object."""
+    """Check that candidates are not known to be of another object.
+
+    Raises:
+        InputError: they are.
+    """
     if candidates.object != obj.name or candidates.digest not in ("", obj.digest):
         raise InputError(f"the candidates are of another {candidates.object!r} than {obj.name!r}; generate new ones.")
 
 
 def _cases(candidates: GraspCandidates) -> list[Case]:
-    """The object as the hand sees it: the inverse of the wrist's pose in the object frame."""
+    """Cases of all candidates: the object's pose in the wrist frame inverts the wrist's pose in the object frame."""
     turn = quaternion_inverse(candidates.quaternion)
     fields = quaternion_apply(turn, -candidates.position), turn, candidates.pregrasp, candidates.grasp
     return [Case(*row) for row in zip(*(field.cpu().numpy() for field in fields), strict=True)]
@@ -264,7 +269,7 @@ def _part_force(touch: HandContacts | None, parts: int) -> np.ndarray:
 
 
 def _pressed(contacts: list[HandContacts | None]) -> tuple[Float[Tensor, "c k 3"], Int[Tensor, "c k"]]:
-    """Points that carry force and their contact classes, filled up to the largest number of them."""
+    """Contact points that carry force and their contact classes, padded to the largest number of them."""
     pressing = [np.zeros(0, np.int64) if touch is None else np.flatnonzero(touch.force > 0) for touch in contacts]
     most = max(map(len, pressing))
     points, finger = torch.zeros(len(contacts), most, 3), torch.zeros(len(contacts), most, dtype=torch.long)
@@ -276,7 +281,7 @@ def _pressed(contacts: list[HandContacts | None]) -> tuple[Float[Tensor, "c k 3"
 
 
 def _label_force(contacts: list[HandContacts | None], obj: AffordanceObject) -> Float[Tensor, "c labels"]:
-    """Force by the region of the surface point nearest to each contact point, all candidates at once."""
+    """Force by region [N]; a contact point belongs to the region of the surface point nearest to it."""
     found = torch.zeros(len(contacts), len(obj.labels))
     known = [(row, touch) for row, touch in enumerate(contacts) if touch is not None and len(touch.part)]
     if known:
