@@ -16,6 +16,8 @@ FEWEST_WORDS = 4
 UNIT = r"(?:m|mm|cm|km|rad|deg|kg|g|s|ms|us|N|Hz|J|W|pixels|points|kg/m\^3)(?:\^\d)?"
 PHRASE = re.compile(rf"(?:1/)?{UNIT}(?:[ /*]{UNIT})*|per {UNIT}")
 PARENTHESIS = re.compile(r"(?<![\w\]`/])\(([^()]*)\)")
+DOCUMENTED = [path for path in MODULES if not {"tasks", "tools", "models"} & set(path.relative_to(ROOT).parts)]
+"""Modules whose constants all have a string below them."""
 CONSTANT = re.compile(r"_?[A-Z][A-Z0-9_]*")
 
 
@@ -73,3 +75,66 @@ def test_units_stand_in_square_brackets(path: Path) -> None:
         for line, text in units_in_parentheses(words)
     ]
     assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_first_line_of_a_module_says_what_lives_there(path: Path) -> None:
+    """A sentence of a few words, of packages too."""
+    words = ast.get_docstring(ast.parse(path.read_text())) or ""
+    first = words.splitlines()[0] if words else ""
+    assert len(first.split()) >= FEWEST_WORDS, f"{path.relative_to(ROOT)}:1: {first!r}"
+    assert not first.startswith("Package"), f"{path.relative_to(ROOT)}:1: {first!r}"
+    assert first.endswith((".", "`", ";", ",")) or len(words.splitlines()) == 1, (
+        f"{path.relative_to(ROOT)}:1: {first!r}"
+    )
+
+
+@pytest.mark.parametrize("path", DOCUMENTED, ids=lambda path: str(path.relative_to(ROOT)))
+def test_constants_are_documented_below_them(path: Path) -> None:
+    """By a string literal, not by a comment at the end of the line."""
+    found = undocumented(path.read_text())
+    assert not found, "\n".join(f"{path.relative_to(ROOT)}:{name}" for name in found)
+
+
+def named(text: str) -> list[str]:
+    """Dotted names below `dora` and paths below `dora/`, `tests/` and the like on a page, without placeholders."""
+    dotted = re.findall(r"(?<![\w/.-])dora(?:\.\w+)+(?!\w*/)", text)
+    files = re.findall(r"(?<![\w/.-])(?:dora|experiments|examples|tests)/[\w./-]*\w/?", text)
+    return [name for name in dotted + files if not re.search(r"\b[A-Z]{3,}\b", name)]
+
+
+def exists(name: str) -> bool:
+    """Whether a path, or a dotted module or name within one, is there."""
+    if "/" in name:
+        return (ROOT / name).exists()
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        place = ROOT.joinpath(*parts[:count])
+        source = place.with_suffix(".py") if place.with_suffix(".py").is_file() else place / "__init__.py"
+        if source.is_file():
+            words = source.read_text()
+            return all(re.search(rf"\b{part}\b", words) for part in parts[count:])
+    return False
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_modules_and_files_that_a_page_names_exist(page: Path) -> None:
+    """So that moved modules do not leave dead names behind."""
+    missing = [name for name in named(page.read_text()) if not exists(name)]
+    assert not missing, f"{page.relative_to(ROOT)} names {', '.join(missing)}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_of_a_page_lead_somewhere(page: Path) -> None:
+    """Relative links only; the anchor has to be a heading of the page it leads to."""
+    missing = []
+    for target in re.findall(r"\]\(([^)#\s]*(?:#[^)\s]*)?)\)", page.read_text()):
+        path, _, anchor = target.partition("#")
+        if "://" in path:
+            continue
+        file = (page.parent / path).resolve() if path else page
+        headings = re.findall(r"^#+ (.*)$", file.read_text(), re.M) if file.suffix == ".md" and file.is_file() else []
+        anchors = {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+        if not file.exists() or (anchor and anchor not in anchors):
+            missing.append(target)
+    assert not missing, f"{page.relative_to(ROOT)} links to {', '.join(missing)}"

@@ -7,8 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 AGENTS = ("ppo", "sac", "mappo", "happo")
+"""Names of the learners."""
 SINGLE_ARM_AGENTS = ("ppo", "sac")
+"""Names of the learners for tasks with one arm."""
 GUIDANCES = ("affordance", "none")
+"""Values of the switch guidance."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +155,7 @@ class RunConfig:
 
 
 LEARNER_CONFIGS: dict[str, type[PPOConfig] | type[SACConfig]] = {"ppo": PPOConfig, "sac": SACConfig}
+"""Settings by name of the learner."""
 
 
 def config_from_dict(content: dict[str, Any]) -> RunConfig:

@@ -28,8 +28,11 @@ from dora.errors import InputError
 from dora.tasks import check_task_id, make_task
 
 VIDEO_EPISODES = 3
-INTERRUPTED = 130  # exit status after Ctrl-C
-BAD_INPUT = 2  # exit status after input that a person can mend
+"""Number of episodes in a film."""
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+BAD_INPUT = 2
+"""Exit status after input that a person can correct."""
 
 
 @dataclass

@@ -71,6 +71,7 @@ WITHOUT_PRIOR: dict[str, dict[str, Any]] = {"sac": {"prior": 0.0}}
 """Settings of each learner where actions correct nothing and zero action is no prior to be pulled to."""
 
 POSITIVE = ("total_steps", "num_envs", "eval_every", "eval_episodes", "final_episodes", "eval_envs")
+"""Settings of a run that must be positive."""
 
 
 def recommended(env: str, agent: str | None = None, **overrides: Any) -> RunConfig:

@@ -32,6 +32,7 @@ PARTS = (
 """Names of the parts. `distance_region` includes the field look-up whose normals `closure` uses; `closing` excludes
 the forward kinematics of the closed hand; `gradient` maps forces on bodies to wrist and joints."""
 _FORWARD, _CONTACTS, _CLOSURE, _CLOSING, _SPHERES, _SELF, _LIMITS, _GRADIENT, _ADAM = range(len(PARTS))
+"""Indices into `PARTS`."""
 
 
 @native
