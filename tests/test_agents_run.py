@@ -13,7 +13,7 @@ from dora.agents.evaluation.play import load_policy
 from dora.agents.runs.presets import PRESETS, recommended
 from dora.agents.runs.run_folder import RunFolder
 
-SHIPPED = sorted((Path(__file__).parents[1] / "results").rglob("policy.safetensors"))
+COMMITTED = sorted((Path(__file__).parents[1] / "results").rglob("policy.safetensors"))
 """Policies of the results that the README shows."""
 
 
@@ -77,8 +77,8 @@ def test_a_bare_command_takes_the_learner_recommended_for_the_task():
     assert recommended("DoraJug-v1", "ppo").agent == "ppo"
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parts[-3]}/{path.parts[-2]}")
-def test_a_shipped_policy_is_that_of_the_result_beside_it(path: Path):
+@pytest.mark.parametrize("path", COMMITTED, ids=lambda path: f"{path.parts[-3]}/{path.parts[-2]}")
+def test_a_bundled_policy_is_that_of_the_result_beside_it(path: Path):
     checkpoint, result = read_checkpoint(path), json.loads((path.parent / "result.json").read_text())
     load_policy(checkpoint, path)
     assert (checkpoint.config.env, checkpoint.config.seed) == (result["env"], result["seed"])
@@ -86,10 +86,10 @@ def test_a_shipped_policy_is_that_of_the_result_beside_it(path: Path):
     assert checkpoint.config.digest() == result["config_digest"]
 
 
-def test_a_shipped_policy_can_be_evaluated_alone(
+def test_a_bundled_policy_can_be_evaluated_alone(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    policy = next(path for path in SHIPPED if "DoraCube-v1" in path.parts)
+    policy = next(path for path in COMMITTED if "DoraCube-v1" in path.parts)
     arguments = f"--eval-only --checkpoint {policy} --episodes 4 --workers 1 --preset none --out {tmp_path / 'eval'}"
     assert call(script, monkeypatch, *arguments.split()) == 0
     captured = capsys.readouterr()

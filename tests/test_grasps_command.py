@@ -49,7 +49,7 @@ def script() -> ModuleType:
         ("--object jug --out /proc/nowhere/a.safetensors", "choose another --out"),
         ("--object jug --robot ur5", "unknown robot 'ur5'"),
         ("--mesh nowhere.stl", "nowhere.stl"),
-        ("--ship", "no object ''"),
+        ("--make-bundle", "no object ''"),
     ],
 )
 def test_bad_input(
@@ -172,12 +172,12 @@ def test_searches_by_region_and_the_votes(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ):
     """12 grasps by the handle asked for, and as many of a free search, of the body's and of the rim's."""
-    shipped = GraspCandidates.load(bundled_path("jug"))
+    bundled = GraspCandidates.load(bundled_path("jug"))
     asked = []
 
     def search(obj, robot, num, seed, region, settings, progress) -> GraspCandidates:
         asked.append((region, num))
-        return shipped.select(slice(num))
+        return bundled.select(slice(num))
 
     monkeypatch.setattr(grasps, "optimise", search)
     monkeypatch.setattr(grasps, "validate", lambda c, obj, *rest, **named: at_handle_and_body(c, *rest, **named))
@@ -198,7 +198,7 @@ def test_searches_by_region_and_the_votes(
         closed, before = voting[group]["closed_hand"], voting[group]["candidate"]
         assert closed["balanced_accuracy"] == 1
         assert closed["confusion"] == [[each, 0, 0, 0], [0, each, 0, 0], [0, 0, 0, 0]]
-        assert before["balanced_accuracy"] == pytest.approx(0.5)  # the shipped ones touch the handle
+        assert before["balanced_accuracy"] == pytest.approx(0.5)  # the bundled ones touch the handle
         assert before["recall"] == {"body": 0, "handle": 1}
 
 
@@ -218,7 +218,7 @@ FOREIGN = {
     ),
     "envs/tasks/fmb/assets/purple_u.ply": ((), {"box": {"min": [-1, -1, -1], "max": [1, 0, 1]}}),
 }
-"""A laboratory beaker and a CAD part, which ManiSkill ships: options, and a region that they get here."""
+"""A laboratory beaker and a CAD part, which ManiSkill contains: options, and a region that they get here."""
 
 
 @pytest.mark.parametrize("name", FOREIGN)

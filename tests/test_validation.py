@@ -1,4 +1,4 @@
-"""The protocol's postures, objects as bodies, and the validation of grasps by simulation."""
+"""Postures of the grasp test, objects as bodies, and the validation of grasps by simulation."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -77,7 +77,7 @@ def test_squeezing_moves_flexing_joints_only_and_keeps_couplings_and_limits():
 
 
 @pytest.mark.parametrize("change", [{"friction": 0.0}, {"duration": -1.0}, {"ramp": 1.5}, {"squeeze": float("nan")}])
-def test_a_senseless_protocol_is_refused(change: dict[str, float]):
+def test_a_senseless_setting_is_refused(change: dict[str, float]):
     with pytest.raises(InputError, match=next(iter(change))):
         GraspTestSettings(**change)
 

@@ -1,6 +1,6 @@
 """Show an object, its regions and its grasps on a web page.
 
-    python experiments/view.py jug                                  # one of our objects with its shipped grasps
+    python experiments/view.py jug                                  # one of our objects with its bundled grasps
     python experiments/view.py runs/grasps/jug.safetensors          # what experiments/grasps.py wrote
     python experiments/view.py mug.glb --labels mug.yaml            # the regions of your own mesh
     python experiments/view.py runs/grasps/mug.safetensors --mesh mug.glb --labels mug.yaml

@@ -24,7 +24,7 @@ from dora.tasks.env.base import DoraEnv
 TASKS = {"cube": "DoraCube-v1", "jug": "DoraJug-v1", "hammer": "DoraHammer-v1"}
 """The task in which the grasps of an object are executed."""
 FIRST_TRIES, MORE_TRIES = 6, 30
-"""Episodes per grasp of a proof that makes a shipped set: of all grasps, then of the better ones."""
+"""Episodes per grasp of a ranking that makes a bundled set: of all grasps, then of the better ones."""
 BETTER = 0.2
 """Share of them that is tried again."""
 BATCH = 64
@@ -128,10 +128,10 @@ def _executed(task: DoraEnv, seed: int) -> Bool[Tensor, " n"]:
     return info["success"] & ~failed & (task.episode.max_penetration <= CLEAN * task.PENETRATION_LIMIT)
 
 
-def ranked(candidates: GraspCandidates, proof: TaskRanking) -> GraspCandidates:
-    """The candidates with the proof's scores, best first; among equals, those that were reached more often."""
-    order = torch.argsort(proof.score + 1e-6 * proof.tries, descending=True, stable=True)
-    return replace(candidates, score=proof.score).select(order)
+def ranked(candidates: GraspCandidates, ranking: TaskRanking) -> GraspCandidates:
+    """The candidates with the scores of a ranking, best first; among equals, those that were reached more often."""
+    order = torch.argsort(ranking.score + 1e-6 * ranking.tries, descending=True, stable=True)
+    return replace(candidates, score=ranking.score).select(order)
 
 
 def usable_in_task(name: str) -> Callable[[GraspCandidates], Bool[Tensor, " c"]] | None:
@@ -165,7 +165,7 @@ class _Usable:
 
 
 def rank_bundled_set(name: str, phase: Callable[[str], Callable[[int, int], None]]) -> Path:
-    """Executes the shipped grasps of an object's target class in its task and stores them anew, best first.
+    """Executes the bundled grasps of an object's target class in its task and stores them anew, best first.
 
     All are tried a few times, and the better ones again with other starts: their scores are those of the second round,
     and those of the others at most as high. Grasps of other classes follow as they were. The tables of f_reach that

@@ -1,4 +1,4 @@
-"""Confusion and balanced accuracy of votes, and when a region is clearly held."""
+"""Confusion and balanced accuracy of votes, and when a region is dominant."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ NAMES = ("handle", "head", "face")
 
 
 def agreement(*cells: tuple[int, int, int]) -> Confusion:
-    """From (held, voted, times)."""
+    """From (measured, voted, times)."""
     held = torch.tensor([h for h, _, n in cells for _ in range(n)])
     voted = torch.tensor([v for _, v, n in cells for _ in range(n)])
     return Confusion.of(NAMES, voted, held)
