@@ -137,7 +137,7 @@ def measure(name: str, robot: RobotDescription, settings: Settings | None = None
 
     Args:
         name: one of `available_objects`; what its task wants held is the region.
-        robot: whose hand it is.
+        robot: the robot whose hand grasps.
         settings: of the search.
 
     Raises:

@@ -15,7 +15,7 @@ def pregrasp(
     """The slightly open hand before closing: every flexing joint opened by `test_settings.opening`, within limits.
 
     Args:
-        robot: the robot whose hand it is.
+        robot: the robot of the hand.
         joints: posture in contact, in the order of `robot.hand` [rad].
         test_settings: its `opening` is the angle.
 
