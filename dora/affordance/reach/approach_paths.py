@@ -34,7 +34,7 @@ class ReachSettings:
     """Numbers of the motion-feasibility filter.
 
     Attributes:
-        motion: the transit from the start posture to the standoff: "servo" rolls out the tasks' wrist controller;
+        motion: the transit from the start posture to the standoff: "controller" rolls out the tasks' wrist controller;
             "plan" tries a straight line in joint space and then a planner; "none" requires no transit.
         standoff: length of the approach [m].
         spacing: distance of the postures that are checked along the approach [m].
@@ -45,12 +45,12 @@ class ReachSettings:
         clearance: smallest distance from the object in the transit [m].
         speed: speed of the wrist on the approach [m/s], at which no joint may exceed its velocity limit.
         seeds: number of seeds of the inverse kinematics per candidate.
-        stride: control steps between two postures that are checked with motion "servo".
+        stride: control steps between two postures that are checked with motion "controller".
         plan: effort of the planner.
-        controller: numbers of the wrist controller that motion "servo" rolls out.
+        controller: numbers of the wrist controller that motion "controller" rolls out.
     """
 
-    motion: Literal["servo", "plan", "none"] = "servo"
+    motion: Literal["controller", "plan", "none"] = "controller"
     standoff: float = 0.1
     spacing: float = 0.02
     table_height: float = 0.0
@@ -102,8 +102,8 @@ def attempts(
         start: (dof,) arm joints from which motions start [rad].
         settings: numbers of the filter.
     """
-    if settings.motion == "servo":
-        yield lambda rows: _servo(kinematics, goals[rows], start, settings)
+    if settings.motion == "controller":
+        yield lambda rows: _controller_paths(kinematics, goals[rows], start, settings)
         return
     solutions = kinematics.solve(goals.position, goals.quaternion, settings.seeds)
     for index in range(settings.seeds):
@@ -115,7 +115,9 @@ def _count(settings: ReachSettings) -> int:
     return 1 + max(1, round(settings.standoff / settings.spacing))
 
 
-def _servo(kinematics: InverseKinematics, goals: Goals, start: Tensor, settings: ReachSettings) -> ApproachPaths:
+def _controller_paths(
+    kinematics: InverseKinematics, goals: Goals, start: Tensor, settings: ReachSettings
+) -> ApproachPaths:
     """Paths of the wrist controller; the failure is "out of reach" where the inverse kinematics finds no solution."""
     path = goals.position, goals.quaternion, goals.approach, settings.standoff
     m = roll_out(kinematics.chain, start, *path, settings.controller)
