@@ -1,4 +1,4 @@
-"""Digests of settings and data: sha256 of values under stable keys, whatever the classes that hold them are called."""
+"""Digests of settings and data: sha256 of values under stable keys, independent of the names of their classes."""
 
 import dataclasses
 import hashlib
@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 KEY = "digest_key"
-"""Key of a field's metadata with the name under which it counts; renaming the field then changes no digest."""
+"""Key of a field's metadata whose value replaces the field's name in digests, so that it can be renamed."""
 
 
 def digest_of(value: Any) -> str:
@@ -31,7 +31,7 @@ def digest_of(value: Any) -> str:
 
 
 def _feed(digest: Any, value: Any) -> None:
-    """Adds a value, preceded by its kind and length, so that no two values are fed the same bytes."""
+    """Adds a value, preceded by its kind and length, so that different values give different bytes."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = dataclasses.fields(value)
         _feed(digest, {f.metadata.get(KEY, f.name): getattr(value, f.name) for f in fields})

@@ -1,4 +1,4 @@
-"""The one exception that Dora raises for input a person can mend."""
+"""The exception that Dora raises for input that a person can correct."""
 
 
 class InputError(ValueError):

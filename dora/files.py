@@ -1,4 +1,4 @@
-"""Files that are either old or new, never half written, and safetensors that notice damage."""
+"""Atomic writing of files, and safetensors files with a digest that detects damage."""
 
 import csv
 import hashlib
@@ -19,10 +19,10 @@ from dora.errors import InputError
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Replace `path` by `content`: write beside it, flush to the disk, rename.
+    """Replace `path` by `content` atomically: write a file beside it, flush it to the disk, rename it.
 
     Raises:
-        InputError: if the disk is full or the folder cannot be written; `path` is as it was.
+        InputError: the disk is full or the folder cannot be written; `path` is unchanged.
     """
     temporary = None
     try:
@@ -50,12 +50,20 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Replace `path` by a JSON object."""
+    """Replace `path` by a JSON object, atomically.
+
+    Raises:
+        InputError: as `write_bytes`.
+    """
     write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Replace `path` by a table."""
+    """Replace `path` by a table of comma-separated values, atomically; floats have six digits.
+
+    Raises:
+        InputError: as `write_bytes`.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
@@ -64,9 +72,16 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) 
 
 
 def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
-    """Replace `path` by a safetensors file of the format `kind` (name and version, such as "dora-grasps 1").
+    """Replace `path` by a safetensors file, atomically.
 
-    `metadata` is anything that JSON can hold; `read_tensors` gives it back.
+    Args:
+        path: path of the file.
+        kind: name and version of the format, such as "dora-grasps 1".
+        tensors: tensors by name.
+        metadata: values that JSON can represent; `read_tensors` returns them.
+
+    Raises:
+        InputError: as `write_bytes`.
     """
     own = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     text = json.dumps(dict(metadata))
@@ -77,7 +92,7 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, An
     """Tensors and metadata of a file written by `write_tensors`.
 
     Raises:
-        InputError: if it is missing, truncated, damaged, or of another format or version than `kind`.
+        InputError: the file is missing, truncated, damaged, or of another format or version than `kind`.
     """
     if not path.is_file():
         raise InputError(f"There is no file {path}: give the path of a {kind} file (.safetensors).")

@@ -25,7 +25,7 @@ from dora.tasks.cube import CubeConfig
 from dora.tasks.env.options import task_config
 from dora.tasks.mdp.randomisation import PRESETS
 
-SHIPPED = sorted((Path(__file__).parents[1] / "results").rglob("policy.safetensors"))
+COMMITTED = sorted((Path(__file__).parents[1] / "results").rglob("policy.safetensors"))
 """Policies of the results that the README shows."""
 FIRST = Path(dora.agents.__file__).parent / "first_numbers.yaml"
 """Numbers of runs whose settings hold none."""
@@ -152,8 +152,8 @@ def test_settings_of_a_folder_are_checked(tmp_path: Path, change: dict[str, Any]
         run.parse(["--resume", str(tmp_path)])
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parts[-3]}/{path.parts[-2]}")
-def test_a_shipped_policy_is_that_of_the_result_beside_it(path: Path):
+@pytest.mark.parametrize("path", COMMITTED, ids=lambda path: f"{path.parts[-3]}/{path.parts[-2]}")
+def test_a_bundled_policy_is_that_of_the_result_beside_it(path: Path):
     checkpoint, result = read_checkpoint(path), json.loads((path.parent / "result.json").read_text())
     load_policy(checkpoint, path)
     assert (checkpoint.config.env, checkpoint.config.seed) == (result["env"], result["seed"])
@@ -161,7 +161,7 @@ def test_a_shipped_policy_is_that_of_the_result_beside_it(path: Path):
     assert checkpoint.config_digest == result["config_digest"]
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parts[-3]}/{path.parts[-2]}")
+@pytest.mark.parametrize("path", COMMITTED, ids=lambda path: f"{path.parts[-3]}/{path.parts[-2]}")
 def test_policies_of_versions_without_numbers_mean_the_numbers_of_then(path: Path):
     config = read_checkpoint(path).config
     task = find_task(config.env).CONFIG
@@ -170,10 +170,10 @@ def test_policies_of_versions_without_numbers_mean_the_numbers_of_then(path: Pat
     task_config(task, config.preset, config.task)  # every name is known
 
 
-def test_a_shipped_policy_can_be_evaluated_alone(
+def test_a_bundled_policy_can_be_evaluated_alone(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    policy = next(path for path in SHIPPED if "DoraCube-v1" in path.parts)
+    policy = next(path for path in COMMITTED if "DoraCube-v1" in path.parts)
     arguments = f"--eval-only --checkpoint {policy} --episodes 4 --workers 1 --preset none --out {tmp_path / 'eval'}"
     assert call(script, monkeypatch, *arguments.split()) == 0
     captured = capsys.readouterr()

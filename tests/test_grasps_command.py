@@ -13,7 +13,7 @@ from commands import call, load_command
 
 from dora.affordance.bundled_sets import bundled_path
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.protocol import STANDARD
+from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.search.optimise import Settings
 from dora.progress import PhaseProgress
@@ -124,7 +124,7 @@ def test_validity_is_that_of_the_simulation(monkeypatch: pytest.MonkeyPatch):
     obj, robot = load_object("cube"), load_robot("diana7_hit")
     seen = {}
 
-    def judge(candidates, obj, robot, protocol, progress) -> Validation:
+    def judge(candidates, obj, robot, test_settings, progress) -> Validation:
         progress(len(candidates), len(candidates))
         seen["found"] = candidates
         passed = torch.arange(len(candidates)) % 2
@@ -135,7 +135,7 @@ def test_validity_is_that_of_the_simulation(monkeypatch: pytest.MonkeyPatch):
             part_force=torch.zeros(len(candidates), 6), label_force=torch.zeros(len(candidates), 1),
             contacts=candidates.contacts, contact_finger=candidates.contact_finger,
             candidate_penetration=zeros + 0.003 * (torch.arange(len(candidates)) == 3),
-            self_penetration=zeros, protocol=protocol,
+            self_penetration=zeros, test_settings=test_settings,
         )  # fmt: skip
 
     monkeypatch.setattr(grasps, "validate", judge)
@@ -150,7 +150,9 @@ def test_validity_is_that_of_the_simulation(monkeypatch: pytest.MonkeyPatch):
     assert report["valid_per_second"] == pytest.approx(2 / seconds)
 
 
-def at_handle_and_body(candidates: GraspCandidates, robot: object, protocol: object, progress: object) -> Validation:
+def at_handle_and_body(
+    candidates: GraspCandidates, robot: object, test_settings: object, progress: object
+) -> Validation:
     """A verdict by which grasps in turn close upon handle and body, whatever they touched before; two of them slip."""
     jug, count = load_object("jug"), len(candidates)
     by_handle = torch.arange(count) % 2 == 0
@@ -166,7 +168,7 @@ def at_handle_and_body(candidates: GraspCandidates, robot: object, protocol: obj
         reason=reason, displacement=zeros, closing_shift=zeros, penetration=zeros,
         part_force=torch.zeros(count, 6), label_force=force,
         contacts=places[by_handle.long()][:, None], contact_finger=torch.full((count, 1), 2),
-        candidate_penetration=zeros, self_penetration=zeros, protocol=STANDARD,
+        candidate_penetration=zeros, self_penetration=zeros, test_settings=STANDARD,
     )  # fmt: skip
 
 
@@ -174,12 +176,12 @@ def test_searches_by_region_and_the_votes(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ):
     """12 grasps by the handle asked for, and as many of a free search, of the body's and of the rim's."""
-    shipped = GraspCandidates.load(bundled_path("jug"))
+    bundled = GraspCandidates.load(bundled_path("jug"))
     asked = []
 
     def search(obj, robot, num, seed, region, settings, progress) -> GraspCandidates:
         asked.append((region, num))
-        return shipped.select(slice(num))
+        return bundled.select(slice(num))
 
     monkeypatch.setattr(grasps, "optimise", search)
     monkeypatch.setattr(grasps, "validate", lambda c, obj, *rest, **named: at_handle_and_body(c, *rest, **named))
@@ -200,7 +202,7 @@ def test_searches_by_region_and_the_votes(
         closed, before = voting[group]["closed_hand"], voting[group]["candidate"]
         assert closed["balanced_accuracy"] == 1
         assert closed["confusion"] == [[each, 0, 0, 0], [0, each, 0, 0], [0, 0, 0, 0]]
-        assert before["balanced_accuracy"] == pytest.approx(0.5)  # the shipped ones touch the handle
+        assert before["balanced_accuracy"] == pytest.approx(0.5)  # the bundled ones touch the handle
         assert before["recall"] == {"body": 0, "handle": 1}
 
 
@@ -220,7 +222,7 @@ FOREIGN = {
     ),
     "envs/tasks/fmb/assets/purple_u.ply": ((), {"box": {"min": [-1, -1, -1], "max": [1, 0, 1]}}),
 }
-"""A laboratory beaker and a CAD part, which ManiSkill ships: options, and a region that they get here."""
+"""A laboratory beaker and a CAD part, which ManiSkill contains: options, and a region that they get here."""
 
 
 @pytest.mark.parametrize("name", FOREIGN)

@@ -7,8 +7,9 @@ import pytest
 import torch
 import trimesh
 
+from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.hand.hand_model import HandModel
-from dora.affordance.hand.protocol import STANDARD, pregrasp, squeeze
+from dora.affordance.hand.postures import pregrasp, squeeze
 from dora.affordance.maps.contact_semantic_map import pressed_contacts, wrist_matrix
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.objects.importing import import_object
@@ -19,7 +20,7 @@ from dora.affordance.search.descent import Descent, Schedule
 from dora.affordance.search.energies import GraspEnergy, Weights
 from dora.affordance.search.initial_poses import InitialPoses, Spread
 from dora.affordance.search.optimise import opened, optimise, table_of
-from dora.affordance.search.quasi_static_closing import hold
+from dora.affordance.search.quasi_static_closing import close_hand
 from dora.affordance.search.search import Search, Settings
 from dora.errors import InputError
 from dora.robot import load_robot
@@ -63,7 +64,7 @@ def test_contacts_are_those_of_the_hand_closed_by_the_model(robot, cube):
     field = SignedDistanceField(obj.solid)
     wrist = wrist_matrix(cube.position, cube.quaternion)
     postures = pregrasp(robot, cube.joints), squeeze(robot, cube.joints)
-    held = hold(CompiledEnergy(hand, field), wrist, *postures, obj.mass)
+    held = close_hand(CompiledEnergy(hand, field), wrist, *postures, obj.mass)
     points, finger = pressed_contacts(hand, field, hand.forward(held.wrist, robot.reduce_hand(held.joints)))
     assert (field.distance(cube.contacts[cube.contact_finger > 0]).abs() < 1e-3).all()
     same = 0

@@ -29,8 +29,7 @@ from dora.geometry.rotations import (
     rotation_vector_from_matrix,
 )
 from dora.robot import SerialChain, load_robot
-from dora.robot.motion import controller_rollout as servo
-from dora.robot.motion import inverse_kinematics
+from dora.robot.motion import controller_rollout, inverse_kinematics
 from dora.robot.motion.collision import CollisionModel
 from dora.robot.motion.height_bounds import ArmHeightBounds, HandHeightBounds
 from dora.robot.motion.inverse_kinematics import ANGLE_TOLERANCE, POSITION_TOLERANCE, InverseKinematics
@@ -221,7 +220,7 @@ def test_nothing_is_left_far_away(robot):
 
 
 @pytest.mark.parametrize(
-    ("name", "motion"), [("jug", "none"), ("jug", "servo"), ("hammer", "servo"), ("hammer", "plan")]
+    ("name", "motion"), [("jug", "none"), ("jug", "controller"), ("hammer", "controller"), ("hammer", "plan")]
 )
 def test_what_passes_stands_up_to_brute_force(robot, kinematics, name, motion):
     """Every accepted candidate is reached exactly, and free along a finely sampled approach."""
@@ -301,7 +300,7 @@ def test_a_plan_leads_where_the_wrist_controller_does_not(robot):
     cube = load_object("cube")
     candidates, poses = clear_grasps(robot, cube, 12), scattered(cube, 3)
     driven, planned = (
-        Reach(robot, cube, settings=ReachSettings(motion=m)).filter(candidates, *poses) for m in ("servo", "plan")
+        Reach(robot, cube, settings=ReachSettings(motion=m)).filter(candidates, *poses) for m in ("controller", "plan")
     )
     stuck = driven.reason == NO_MOTION
     assert stuck.any()
@@ -396,10 +395,10 @@ def test_a_grid_without_places_is_refused():
 
 def test_the_filter_has_the_numbers_of_the_tasks():
     """`dora.affordance` may not import the tasks, so some numbers stand in both."""
-    ours = servo.Controller()
+    ours = controller_rollout.Controller()
     assert ours.period == TaskConfig().dt
     assert (ours.speed, ours.spin) == (controllers.WRIST_SPEED, controllers.WRIST_SPIN)
-    assert servo.LIMIT_MARGIN == controllers.LIMIT_MARGIN
+    assert controller_rollout.LIMIT_MARGIN == controllers.LIMIT_MARGIN
     reference = GraspSettings()
     assert (ours.descent, ours.arrived) == (reference.descent, reference.arrived)
     assert tuple(x / 2 for x in reference.settled) == ours.settled
@@ -410,7 +409,7 @@ def test_a_table_is_made_anew_when_a_number_changes_on_which_motions_depend(robo
     cube, candidates, grid = load_object("cube"), grasps(robot, load_object("cube"), 4), Grid((0.5, 0.0), (0.0, 0.0))
 
     def digest(**numbers):
-        reach = Reach(robot, cube, settings=ReachSettings(controller=servo.Controller(**numbers)))
+        reach = Reach(robot, cube, settings=ReachSettings(controller=controller_rollout.Controller(**numbers)))
         return table_digest(reach, candidates, grid, cube.support, cube.rest)
 
     before, numbers = digest(), {}

@@ -1,4 +1,4 @@
-"""The protocol's postures, objects as bodies, and the validation of grasps by simulation."""
+"""Postures of the grasp test, objects as bodies, and the validation of grasps by simulation."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,7 +12,8 @@ from mani_skill.envs.utils.system.backend import BackendInfo
 from sapien import physx
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.protocol import STANDARD, Protocol, flexion, pregrasp, squeeze
+from dora.affordance.hand.grasp_test_settings import STANDARD, GraspTestSettings
+from dora.affordance.hand.postures import flexion, pregrasp, squeeze
 from dora.affordance.objects.catalogue import load_object
 from dora.errors import InputError
 from dora.parallel import run_cases
@@ -76,9 +77,9 @@ def test_squeezing_moves_flexing_joints_only_and_keeps_couplings_and_limits():
 
 
 @pytest.mark.parametrize("change", [{"friction": 0.0}, {"duration": -1.0}, {"ramp": 1.5}, {"squeeze": float("nan")}])
-def test_a_senseless_protocol_is_refused(change: dict[str, float]):
+def test_a_senseless_setting_is_refused(change: dict[str, float]):
     with pytest.raises(InputError, match=next(iter(change))):
-        Protocol(**change)
+        GraspTestSettings(**change)
 
 
 def test_a_body_has_mass_inertia_and_materials_of_its_own():
@@ -97,13 +98,13 @@ def test_a_body_has_mass_inertia_and_materials_of_its_own():
 @pytest.mark.parametrize("name", ["cube", "jug", "hammer", "microwave"])
 def test_every_object_rests_on_a_table_as_described(name: str):
     obj = load_object(name)
-    rig = GraspTestScene(obj, ROBOT, 0.7, Physics(), gravity=(0.0, 0.0, -9.81), carriage=True, table=True)
-    rig.hand.reset(np.zeros(20), sapien.Pose([0.0, 0.0, 1.0]))
+    scene = GraspTestScene(obj, ROBOT, 0.7, Physics(), gravity=(0.0, 0.0, -9.81), carriage=True, table=True)
+    scene.hand.reset(np.zeros(20), sapien.Pose([0.0, 0.0, 1.0]))
     start, turn = np.array([0.0, 0.0, obj.support]), np.array(obj.rest)
-    rig.place(start, turn)
-    rig.run(100)
-    assert np.linalg.norm(rig.position - start) < 2e-3
-    assert abs(float(rig.pose.q @ turn)) > 1 - 1e-3
+    scene.place(start, turn)
+    scene.run(100)
+    assert np.linalg.norm(scene.position - start) < 2e-3
+    assert abs(float(scene.pose.q @ turn)) > 1 - 1e-3
 
 
 def test_a_body_that_cannot_be_is_refused():
@@ -129,12 +130,12 @@ def test_maniskill_builds_an_object_per_environment():
 
 
 def test_the_hand_is_where_its_description_says():
-    rig = GraspTestScene(CUBE, ROBOT, 0.7, Physics(), carriage=True)
-    rig.hand.reset(JOINTS.numpy(), sapien.Pose([1.0, 0.0, 0.0]), np.array([0.1, 0.2, 0.3]))
-    palm = next(link for link in rig.hand.articulation.links if link.name == ROBOT.wrist_link)
+    scene = GraspTestScene(CUBE, ROBOT, 0.7, Physics(), carriage=True)
+    scene.hand.reset(JOINTS.numpy(), sapien.Pose([1.0, 0.0, 0.0]), np.array([0.1, 0.2, 0.3]))
+    palm = next(link for link in scene.hand.articulation.links if link.name == ROBOT.wrist_link)
     np.testing.assert_allclose(palm.entity_pose.p, [1.1, 0.2, 0.3], atol=1e-5)
     np.testing.assert_allclose(np.abs(palm.entity_pose.q), [1.0, 0.0, 0.0, 0.0], atol=1e-5)
-    assert rig.hand.lag < 1e-5
+    assert scene.hand.lag < 1e-5
 
 
 def test_good_and_bad_grasps_end_as_they_must():
@@ -149,7 +150,7 @@ def test_good_and_bad_grasps_end_as_they_must():
     assert float(found.closing_shift[0]) < 0.01
     assert 0 < float(found.penetration[0]) < 1e-3
     assert found.touched[0].sum() >= 4
-    assert found.held.tolist()[:2] == [0, -1]
+    assert found.dominant_region.tolist()[:2] == [0, -1]
     torch.testing.assert_close(found.label_force.sum(1), found.part_force.sum(1))
     pressing = found.contact_finger > 0
     assert [set(row[row > 0].tolist()) for row in found.contact_finger] == [
@@ -180,10 +181,10 @@ def test_penetration_and_tidiness_decide_validity():
 
 def test_order_and_number_of_processes_do_not_matter():
     shift = torch.linspace(0.0, 0.03, 6)[:, None] * torch.tensor([0.0, 0.0, 1.0])
-    protocol, seen = replace(STANDARD, duration=0.1), []
-    one = validate(cube_grasps(shift), CUBE, ROBOT, protocol, processes=1)
+    test_settings, seen = replace(STANDARD, duration=0.1), []
+    one = validate(cube_grasps(shift), CUBE, ROBOT, test_settings, processes=1)
     two = validate(
-        cube_grasps(shift.flip(0)), CUBE, ROBOT, protocol, processes=2, progress=lambda done, _: seen.append(done)
+        cube_grasps(shift.flip(0)), CUBE, ROBOT, test_settings, processes=2, progress=lambda done, _: seen.append(done)
     )
     assert one.passed.tolist() == two.passed.flip(0).tolist()
     torch.testing.assert_close(one.closing_shift, two.closing_shift.flip(0), atol=1e-3, rtol=0.0)

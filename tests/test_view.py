@@ -47,10 +47,10 @@ def free_port() -> int:
 
 @pytest.fixture(scope="module")
 def candidates() -> GraspCandidates:
-    """Shipped grasps with invented verdicts: every third is not valid, two classes, energies 0 .. 11."""
-    shipped = GraspCandidates.load(bundled_path("cube"), robot=load_robot("diana7_hit")).select(slice(COUNT))
+    """Bundled grasps with invented verdicts: every third is not valid, two classes, energies 0 .. 11."""
+    bundled = GraspCandidates.load(bundled_path("cube"), robot=load_robot("diana7_hit")).select(slice(COUNT))
     return replace(
-        shipped,
+        bundled,
         grasp_class=("BodyGrasp", "RimGrasp") * (COUNT // 2),
         valid=torch.arange(COUNT) % 3 != 2,
         energy={"closure": torch.arange(COUNT).float()},

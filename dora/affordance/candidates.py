@@ -1,4 +1,4 @@
-"""Grasp candidates of one object: where the wrist goes, how the fingers close, which part is held."""
+"""Grasp candidates of one object: wrist poses, hand joints, contacts and grasp class, with their files."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from dora.robot import RobotDescription
 FORMAT = "dora-grasps 1"
 """Format and version of a file of candidates."""
 UNKNOWN = torch.empty(0)
-"""Stands for a tensor field that is not given; replaced when the candidates are made."""
+"""Marks a tensor field that is not given; replaced by its default in `__post_init__`."""
 DIGITS = 9
-"""Decimals of lengths [m] and angles [rad] that count in a digest."""
+"""Number of decimals of lengths [m] and angles [rad] that enter a digest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,22 +34,22 @@ class GraspCandidates:
         object: name of the object.
         position: (c, 3) wrist origin [m].
         quaternion: (c, 4) wrist orientation, wxyz.
-        approach: (c, 3) unit direction of the wrist's last motion towards the object.
+        approach: (c, 3) unit direction in which the wrist approaches the grasp.
         pregrasp: (c, 20) hand joints before closing [rad].
-        grasp: (c, 20) commanded hand joints of the closed hand [rad]; beyond contact, so that they squeeze.
+        grasp: (c, 20) commanded hand joints of the closed hand [rad]; beyond contact, so that the drives squeeze.
         grasp_class: c names such as "BodyGrasp" or "HandleGrasp".
         joints: (c, 20) hand joints at contact [rad]; `grasp` if not given.
-        contacts: (c, k, 3) points on the object on which the closed hand presses [m]; k = 0 if not given.
-        contact_finger: (c, k) what touches there: 0 nothing, 1 palm, 2 thumb, ... 6 pinky.
-        energy: (c,) per name of an energy term, unweighted.
-        penetration: (c,) deepest overlap of hand and object at `joints` [m]; nan = not measured.
-        self_penetration: (c,) deepest overlap of the hand with itself at `joints` [m]; nan = not measured.
+        contacts: (c, k, 3) contact points of the closed hand on the object [m]; k = 0 if not given.
+        contact_finger: (c, k) contact class of each: 0 no contact, 1 palm, 2 thumb, ... 6 pinky.
+        energy: (c,) unweighted value per name of an energy term.
+        penetration: (c,) penetration depth of hand and object at `joints` [m]; nan = not measured.
+        self_penetration: (c,) penetration depth between links of the hand at `joints` [m]; nan = not measured.
         valid: (c,) whether the grasp passed its validation; true if not given.
-        score: (c,) share of executions that succeeded; nan = not ranked.
+        score: (c,) share of simulated executions that succeeded [1]; nan = not ranked.
         digest: digest of the object's geometry and labels; "" = unknown.
         robot: name of the robot; "" = unknown.
         robot_digest: `hand_digest` of the robot; "" = unknown.
-        settings: how the candidates were made, as text.
+        settings: settings of search, grasp test and ranking, as text.
 
     Raises:
         InputError: no candidate, fields of different lengths, or a pose or joint that is not finite.
@@ -110,7 +110,7 @@ class GraspCandidates:
         }
 
     def with_tensors(self, tensors: dict[str, Tensor], grasp_class: tuple[str, ...]) -> GraspCandidates:
-        """The same object, robot and settings with other tensors, named as by `tensors`."""
+        """A copy with other tensors, named as in `tensors`; object, robot and settings stay."""
         own, energy = _split_energy(tensors)
         return replace(self, grasp_class=grasp_class, energy=energy, **own)
 
@@ -133,11 +133,15 @@ class GraspCandidates:
         return torch.tensor([name in names for name in self.grasp_class], device=self.position.device)
 
     def counts(self) -> dict[str, int]:
-        """How many candidates each grasp class has, most frequent first."""
+        """Number of candidates per grasp class, most frequent first."""
         return dict(Counter(self.grasp_class).most_common())
 
     def save(self, path: Path | str) -> None:
-        """Write a safetensors file, atomically."""
+        """Write a safetensors file, atomically.
+
+        Raises:
+            InputError: it cannot be written.
+        """
         names = sorted(set(self.grasp_class))
         index = torch.tensor([names.index(name) for name in self.grasp_class])
         metadata = {name: getattr(self, name) for name in TEXTS} | {"classes": names}
@@ -147,7 +151,7 @@ class GraspCandidates:
     def load(
         cls, path: Path | str, object: AffordanceObject | None = None, robot: RobotDescription | None = None
     ) -> GraspCandidates:
-        """Read what `save` wrote and, if given, check that it was made for this object and this robot.
+        """Read a file that `save` wrote and check that it was made for the given object and robot.
 
         Raises:
             InputError: no such file, damaged, of another format, or made for something else.
@@ -188,9 +192,9 @@ class GraspCandidates:
 
 
 TEXTS = ("object", "digest", "robot", "robot_digest", "settings")
-"""Fields that are text."""
+"""Names of the fields that are text."""
 FINITE = ("position", "quaternion", "approach", "pregrasp", "grasp", "joints", "contacts")
-"""Fields in which nan and infinity are refused."""
+"""Names of the fields in which NaN and infinity are refused."""
 
 
 def _split_energy(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -203,7 +207,7 @@ def _split_energy(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[s
 def concatenate(sets: Sequence[GraspCandidates]) -> GraspCandidates:
     """All candidates of several sets of one object and one robot; settings are those of the first.
 
-    Sets with fewer contacts per candidate are filled with contact_finger 0; energies that a set lacks are nan.
+    Sets with fewer contacts per candidate are padded with contact class 0; energies that a set lacks are nan.
 
     Raises:
         InputError: no set, or sets of different objects, robots or digests.
@@ -228,7 +232,7 @@ def concatenate(sets: Sequence[GraspCandidates]) -> GraspCandidates:
 
 
 def _widened(candidates: GraspCandidates, width: int) -> dict[str, Tensor]:
-    """Tensors with `width` contacts per candidate."""
+    """The tensors of candidates, padded to `width` contacts per candidate."""
     more = width - candidates.contacts.shape[1]
     contacts = torch.nn.functional.pad(candidates.contacts, (0, 0, 0, more))
     finger = torch.nn.functional.pad(candidates.contact_finger, (0, more))
@@ -236,8 +240,11 @@ def _widened(candidates: GraspCandidates, width: int) -> dict[str, Tensor]:
 
 
 def hand_digest(robot: RobotDescription) -> str:
-    """sha256 of what a stored grasp depends on: joints, limits and couplings of the hand, and the tree and
-    collision shapes of the links that move with the wrist. Gains and the arm do not count."""
+    """sha256 of what a stored grasp depends on in the robot.
+
+    These are the hand's joints, limits and couplings, and the tree and collision shapes of the links that the wrist
+    carries. Gains and the arm do not enter.
+    """
     joints = [joint for joint in robot.model.joints.values() if _carried(robot, joint.child)]
     links = sorted({robot.wrist_link} | {joint.child for joint in joints})
     tree = {
@@ -254,5 +261,5 @@ def hand_digest(robot: RobotDescription) -> str:
 
 
 def _carried(robot: RobotDescription, link: str) -> bool:
-    """Whether a link hangs on the wrist."""
+    """Whether the wrist link carries a link, directly or through others."""
     return any(joint.parent == robot.wrist_link for joint in robot.model.chain(link))

@@ -18,7 +18,9 @@ from dora.errors import InputError
 from dora.files import write_bytes
 
 FORMAT = "dora-checkpoint"
+"""Format of a checkpoint file."""
 VERSION = 1
+"""Version of that format."""
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,7 @@ def bench_grasp(object: str = "cube", robot: str = "diana7_hit", json: bool = Fa
 
 
 PHYSICS = ("120:10:8", "240:2:8", "240:3:6", "240:5:4", "240:5:8", "240:10:4", "240:10:8", "240:10:15", "480:10:8")
+"""Default physics settings: rate [Hz], contact offset [mm], position iterations."""
 
 
 @app.command(name="physics")

@@ -26,9 +26,12 @@ from dora.sim.grasp_tests.generation import baselines, by_region, generate, summ
 from dora.sim.grasp_tests.report import check_out, print_report, write_report
 from dora.tools.task_ranking import rank_bundled_set, tasks_of, usable_in_task
 
-INTERRUPTED = 130  # exit status after Ctrl-C
-BAD_INPUT = 2  # exit status after input that a person can mend
-ANY = "any"  # value of --region for a free search
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+BAD_INPUT = 2
+"""Exit status after input that a person can correct."""
+ANY = "any"
+"""Value of --region for a search without a region."""
 
 
 @dataclass

@@ -29,8 +29,10 @@ from dora.affordance.views.page import GraspPage
 from dora.errors import InputError
 from dora.robot import RobotDescription, load_robot
 
-BAD_INPUT = 2  # exit status after input that a person can mend
-GRASPS = ".safetensors"  # suffix of a file of grasps
+BAD_INPUT = 2
+"""Exit status after input that a person can correct."""
+GRASPS = ".safetensors"
+"""Suffix of a file of grasps."""
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """Rotations in pure torch: unit quaternions (w, x, y, z), matrices and rotation vectors, batched.
 
 All functions accept any leading batch shape, keep dtype and device, and have finite gradients everywhere,
-also at the identity and at half a turn. Rotation vectors are axis times angle in rad.
+also at the identity and at half a turn. Rotation vectors are axis times angle [rad].
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 SMALL_ANGLE = 1e-4
-"""Below this angle (rad) series replace quotients; their relative error is below 1e-16."""
+"""Angle below which series replace quotients, with a relative error below 1e-16 [rad]."""
 
 
 def quaternion_multiply(a: Float[Tensor, "*#batch 4"], b: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*out 4"]:
@@ -109,12 +109,12 @@ def rotation_vector_from_matrix(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Te
 
 
 def rotation_angle(a: Float[Tensor, "*#batch 4"], b: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*out"]:
-    """Angle in [0, pi] rad between two unit quaternions."""
+    """Angle between two unit quaternions, from 0 to pi [rad]."""
     return rotation_vector_from_quaternion(quaternion_multiply(quaternion_inverse(a), b)).norm(dim=-1)
 
 
 def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Quaternion of URDF's fixed-axis angles (rad): about x, then y, then z of the parent frame."""
+    """Quaternion wxyz of URDF's fixed-axis angles [rad]: about x, then y, then z of the parent frame."""
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a / 2), math.sin(a / 2)) for a in (roll, pitch, yaw))
     return (
         cr * cp * cy + sr * sp * sy,
@@ -125,6 +125,6 @@ def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, f
 
 
 def rpy_from_z_axis(direction: Sequence[int | float]) -> tuple[float, float, float]:
-    """Fixed-axis angles (rad) with yaw after pitch that turn +z into `direction` (any length > 0)."""
+    """Fixed-axis angles (roll 0, pitch, yaw) [rad] that rotate +z into `direction` (any length above 0)."""
     x, y, z = direction
     return 0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x) if x or y else 0.0

@@ -1,4 +1,4 @@
-"""Robots as data, kinematics and rotations; no simulator."""
+"""Robots as data: descriptions, URDF, collision shapes and kinematics, without a simulator."""
 
 from dora.robot.description import (
     Contact,

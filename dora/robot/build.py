@@ -20,15 +20,18 @@ from dora.errors import InputError
 from dora.geometry.rotations import rpy_from_z_axis
 
 Row = Mapping[str, Any]
+"""One row of the parameter table."""
 INERTIA_NAMES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+"""Attributes of <inertia>, in the order of a row's `inertia` [kg m^2]."""
 HEADER = "<!-- Generated from parameters.yaml by `python -m dora.robot.build`: edit that, not this. -->"
+"""First comment of a generated URDF."""
 
 
 def build_urdf(parameters: Row) -> str:
     """URDF text of a parameter table.
 
     Args:
-        parameters: the content of `parameters.yaml`; lengths in m, angles in rad, masses in kg.
+        parameters: the content of `parameters.yaml`: lengths [m], angles [rad], masses [kg].
 
     Returns:
         The XML text, links and joints in the order of the table.
@@ -63,7 +66,7 @@ def write_urdf(folder: Path) -> Path:
 
 
 def _expand(parameters: Row) -> tuple[dict[str, Row], list[Row]]:
-    """Links and joints with the finger template written out, finger by finger."""
+    """Links and joints with the finger template expanded for every finger."""
     links, joints = dict(parameters["links"]), list(parameters["joints"])
     template = parameters.get("fingers", {"instances": {}})
     for finger, own in template["instances"].items():
@@ -137,6 +140,7 @@ def _capsule(shape: Row) -> list[tuple[str, str]]:
 
 
 _SHAPES = {"box": _box, "sphere": _sphere, "cylinder": _cylinder, "capsule": _capsule}
+"""Functions that write each kind of shape as pairs of <origin> and geometry."""
 
 
 def _origin(xyz: Sequence[int | float], rpy: Sequence[int | float] = (0.0, 0.0, 0.0)) -> str:

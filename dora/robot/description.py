@@ -1,4 +1,4 @@
-"""What a robot is, without a simulator: joints, fingers, postures, collision shapes, contact settings.
+"""The description of a robot without a simulator: joints, fingers, postures, collision shapes, contact settings.
 
 A robot is a folder with `robot.toml` and a URDF; `dora.robot.loading` reads it. Adding one needs no Python.
 """
@@ -18,17 +18,23 @@ from dora.robot.shapes import Shape
 from dora.robot.urdf import UrdfModel
 
 MAX_COLLISION_BITS = 30
-"""Bits of PhysX's collision word that a robot may use; the last two stay free for tasks."""
+"""Number of bits of PhysX's collision word that a robot may use; the last two stay free for tasks."""
 
 Array = TypeVar("Array", np.ndarray, torch.Tensor)
 
 
 @dataclass(frozen=True, eq=False)
 class JointGroup:
-    """Joints driven together; every array is float64 of shape (len(names),).
+    """A group of joints that are controlled together; every array is float64 of shape (n,).
 
-    `lower`, `upper` rad; `velocity` rad/s; `effort` N m; `stiffness` N m/rad; `damping` N m s/rad;
-    `armature` kg m^2.
+    Attributes:
+        names: n names of joints.
+        lower, upper: limits [rad].
+        velocity: velocity limits [rad/s].
+        effort: torque limits [N m].
+        stiffness: stiffness of the drives [N m/rad].
+        damping: damping of the drives [N m s/rad].
+        armature: inertia added to the joints [kg m^2].
     """
 
     names: tuple[str, ...]
@@ -46,10 +52,10 @@ class JointGroup:
 
 @dataclass(frozen=True, eq=False)
 class Finger:
-    """One finger: its joints from the palm outwards, its links, and the pad's contact point.
+    """One finger: its joints from the palm outwards, its links, and the contact point of its pad.
 
-    `tip` is a fixed frame whose z axis points out of the fingertip; `pad` is a point (3,) in m in the
-    frame of `distal`.
+    `tip` is a fixed frame whose z axis points out of the fingertip; `pad` (3,) is a point in the frame of
+    `distal` [m].
     """
 
     name: str
@@ -68,7 +74,7 @@ class Finger:
 
 @dataclass(frozen=True)
 class Coupling:
-    """Commanded target of hand joint `follower` = `multiplier` * target of `leader` + `offset` (rad).
+    """A coupled joint: target of `follower` = `multiplier` [1] * target of `leader` + `offset` [rad].
 
     Joints are indices into the hand group.
     """
@@ -81,7 +87,7 @@ class Coupling:
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """Named joint angles in rad, in the order of the joint groups: `arm` (n_arm,), `hand` (n_hand,)."""
+    """Joint angles in the order of the joint groups: `arm` (n_arm,), `hand` (n_hand,) [rad]."""
 
     arm: np.ndarray
     hand: np.ndarray
@@ -89,7 +95,7 @@ class Posture:
 
 @dataclass(frozen=True)
 class Contact:
-    """Contact settings of a link: friction and restitution (unitless), PhysX offsets (m)."""
+    """Contact settings of a link: friction and restitution [1], PhysX's contact and rest offset [m]."""
 
     friction: float
     restitution: float
@@ -101,8 +107,8 @@ class Contact:
 class RobotDescription:
     """A robot as data, shared by the simulator's robot, the grasp optimiser and the controllers.
 
-    `shapes` and `contacts` are keyed by link; `ignored_pairs` are link pairs whose collisions cannot
-    matter (alphabetical within a pair), all others collide; `tip_radius` is that of the fingertips [m].
+    `shapes` and `contacts` are keyed by link; `ignored_pairs` are the link pairs that do not collide
+    (alphabetical within a pair), all others do; `tip_radius` is that of the fingertips [m].
     """
 
     name: str
@@ -123,13 +129,13 @@ class RobotDescription:
 
     @cached_property
     def hand_actuated(self) -> np.ndarray:
-        """Indices of the hand joints that have a drive of their own, ascending."""
+        """Indices (n_actuated,) of the hand joints with a drive of their own, ascending."""
         followers = {coupling.follower for coupling in self.couplings}
         return np.array([index for index in range(len(self.hand)) if index not in followers])
 
     @cached_property
     def _expansion(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Per hand joint: its source among the actuated joints, the multiplier and the offset."""
+        """Per hand joint (n_hand,): index of its source among the actuated joints, multiplier [1], offset [rad]."""
         place = {int(joint): index for index, joint in enumerate(self.hand_actuated)}
         source = np.array([place.get(index, 0) for index in range(len(self.hand))])
         multiplier, offset = np.ones(len(self.hand)), np.zeros(len(self.hand))
@@ -139,21 +145,21 @@ class RobotDescription:
         return source, multiplier, offset
 
     def expand_hand(self, actuated: Array) -> Array:
-        """Targets of all hand joints (..., n_hand) from those of the actuated ones (..., n_actuated), rad."""
+        """Targets of all hand joints (..., n_hand) from those of the actuated ones (..., n_actuated) [rad]."""
         source, multiplier, offset = self._expansion
         if isinstance(actuated, torch.Tensor):
             return actuated[..., source] * actuated.new_tensor(multiplier) + actuated.new_tensor(offset)
         return actuated[..., source] * multiplier + offset
 
     def reduce_hand(self, hand: Array) -> Array:
-        """Targets of the actuated joints (..., n_actuated) out of those of all hand joints (..., n_hand)."""
+        """Targets of the actuated joints (..., n_actuated) from those of all hand joints (..., n_hand) [rad]."""
         return hand[..., self.hand_actuated]
 
     def collision_bits(self) -> dict[str, int]:
         """A bit mask per link such that two links collide exactly when their masks share no bit.
 
-        This is the rule of word 2 of PhysX's filter data in SAPIEN. The masks are a cover of the graph of
-        ignored pairs by cliques, one bit each, found greedily.
+        This is the rule of word 2 of PhysX's filter data in SAPIEN. Each bit stands for one clique of a greedy
+        clique cover of the graph of ignored pairs.
 
         Raises:
             InputError: more than 30 bits would be needed.
@@ -172,10 +178,10 @@ class RobotDescription:
 
 
 def clique_cover(pairs: frozenset[tuple[str, str]]) -> list[frozenset[str]]:
-    """Cliques of the graph with edges `pairs` that together contain every edge and nothing else.
+    """A clique cover of the graph with edges `pairs`: cliques that together contain exactly its edges.
 
-    Greedy: start from the first uncovered edge and add the vertex that covers most uncovered edges, while
-    one exists. Deterministic.
+    Greedy and deterministic: a clique starts from the first uncovered edge and grows by the vertex that covers the
+    largest number of uncovered edges.
     """
     neighbours: dict[str, set[str]] = {}
     for a, b in pairs:

@@ -1,4 +1,4 @@
-"""Batched kinematics of a serial chain of revolute joints: frames, Jacobian, damped least-squares steps.
+"""Batched kinematics of a serial chain of revolute joints: forward kinematics, Jacobian, damped least squares.
 
 The transform of joint i is O_i Rot(a_i, q_i) = A_i + B_i cos q_i + C_i sin q_i with constant 4 x 4 matrices
 (Rodrigues' formula), so all joints are evaluated at once and only their products are sequential.
@@ -19,11 +19,11 @@ from dora.robot.description import RobotDescription
 from dora.robot.urdf import UrdfJoint
 
 DAMPING = 0.03
-"""Default lambda of damped least squares: directions with a singular value well above it are followed."""
+"""Default lambda of damped least squares; motion along singular directions well below it is suppressed."""
 
 
 class Frames(NamedTuple):
-    """Poses in the base frame: of every joint frame after its rotation, and of the chain's tip."""
+    """Poses in the base frame [m]: of every joint frame after its rotation, and of the chain's tip."""
 
     joints: Float[Tensor, "n dof 4 4"]
     tip: Float[Tensor, "n 4 4"]
@@ -80,11 +80,15 @@ class SerialChain:
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ) -> SerialChain:
-        """The chain from the robot's root to its wrist, or to the link `tip`."""
+        """The chain from the robot's root to its wrist, or to the link `tip`.
+
+        Raises:
+            InputError: the chain has no moving joint or one that is not revolute.
+        """
         return cls(description.model.chain(tip or description.wrist_link), dtype, device)
 
     def forward(self, q: Float[Tensor, "n dof"]) -> Frames:
-        """Frames at joint angles `q` (rad)."""
+        """Forward kinematics at joint angles `q` [rad]."""
         angle = q[..., None, None]
         local = torch.addcmul(self._constant, self._cosine, angle.cos()).addcmul(self._sine, angle.sin())
         pose, *rest = local.unbind(1)
@@ -95,16 +99,16 @@ class SerialChain:
         return Frames(torch.stack(frames, 1), pose @ self._tip)
 
     def tip_pose(self, q: Float[Tensor, "n dof"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
-        """Position (m) and rotation matrix of the tip in the base frame."""
+        """Position [m] and rotation matrix of the tip in the base frame."""
         tip = self.forward(q).tip
         return tip[:, :3, 3], tip[:, :3, :3]
 
     def jacobian(self, q: Float[Tensor, "n dof"]) -> Float[Tensor, "n 6 dof"]:
-        """Geometric Jacobian at the tip's origin in the base frame; rows: linear, then angular."""
+        """Geometric Jacobian at the tip's origin in the base frame; rows: linear [m/rad], then angular [1]."""
         return self.jacobian_of(self.forward(q))
 
     def jacobian_of(self, frames: Frames) -> Float[Tensor, "n 6 dof"]:
-        """The same from frames that are already known: columns [a_i x (p - p_i); a_i]."""
+        """The geometric Jacobian from known frames: columns (a_i x (p - p_i); a_i)."""
         axes = (frames.joints[..., :3, :3] * self._axes).sum(-1)
         arms = frames.tip[:, None, :3, 3] - frames.joints[..., :3, 3]
         return torch.cat((torch.linalg.cross(axes, arms), axes), -1).transpose(1, 2)
@@ -119,23 +123,23 @@ class SerialChain:
         rest_gain: float = 0.1,
         frames: Frames | None = None,
     ) -> Float[Tensor, "n dof"]:
-        """Change of joint angles (rad) that moves the tip by a small displacement.
+        """One step of damped least squares: the change of joint angles that displaces the tip.
 
-        dq = r + J^T (J J^T + lambda^2 I)^-1 (twist - J r), r = rest_gain (rest - q): damped least squares
-        with a pull towards `rest` in the null space. Defined at every pose, singular ones included.
+        dq = r + J^T (J J^T + lambda^2 I)^-1 (twist - J r) with the nullspace motion r = rest_gain (rest - q).
+        Defined at every pose, singular ones included.
 
         Args:
-            q: joint angles, rad.
-            twist: displacement of the tip in the base frame: linear (m), then a rotation vector (rad).
+            q: joint angles [rad].
+            twist: displacement of the tip in the base frame: linear [m], then a rotation vector [rad].
             damping: lambda.
-            duration: time (s) the step takes; when given, the whole step is scaled, keeping its direction,
-                until no joint exceeds its velocity limit.
-            rest: joint angles (rad) to prefer; none by default.
-            rest_gain: share of the way to `rest` per step.
+            duration: duration of the step [s]; if given, the step is scaled down until no joint exceeds its
+                velocity limit.
+            rest: preferred joint angles [rad]; none by default.
+            rest_gain: share of the way to `rest` per step [1].
             frames: `forward(q)`, if it is known already.
 
         Returns:
-            dq, clamped so that q + dq stays within the joint limits.
+            dq [rad], clamped so that q + dq is within the joint limits.
         """
         jacobian = self.jacobian_of(self.forward(q) if frames is None else frames)
         goal = twist.unsqueeze(-1)
@@ -153,7 +157,7 @@ class SerialChain:
 
 
 def rodrigues(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Matrices (4, 4) with Rot(axis, q) = constant + cosine cos q + sine sin q."""
+    """Matrices (4, 4) of Rodrigues' formula Rot(axis, q) = constant + cosine cos q + sine sin q."""
     x, y, z = axis / np.linalg.norm(axis)
     constant, cosine, sine = np.zeros((3, 4, 4))
     constant[:3, :3] = np.outer((x, y, z), (x, y, z))

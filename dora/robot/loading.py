@@ -1,4 +1,4 @@
-"""Find robots and read `robot.toml` into a `RobotDescription`, refusing anything that does not fit."""
+"""Search for robot folders, and checked reading of `robot.toml` into a `RobotDescription`."""
 
 from __future__ import annotations
 
@@ -18,10 +18,12 @@ from dora.robot.description import Contact, Coupling, Finger, JointGroup, Postur
 from dora.robot.urdf import UrdfModel, read_urdf
 
 ROBOT_FILE = "robot.toml"
+"""Name of the file that makes a folder a robot."""
 SEARCH_VARIABLE = "DORA_ROBOTS"
 """Environment variable with further folders of robots, separated as in PATH."""
 
 Table = dict[str, Any]
+"""A table of a TOML file."""
 
 KEYS = {
     "robot.toml": (
@@ -38,7 +40,7 @@ KEYS = {
 
 
 def robot_folders() -> dict[str, Path]:
-    """Folder of every robot that can be named: the repository's or the wheel's, then DORA_ROBOTS."""
+    """Folder of every robot by name: those of the repository or the wheel, then those in `SEARCH_VARIABLE`."""
     package = Path(dora.__file__).parent
     own = package / "_robots"
     extra = [Path(part) for part in os.environ.get(SEARCH_VARIABLE, "").split(os.pathsep) if part]
@@ -53,7 +55,7 @@ def available_robots() -> list[str]:
 
 
 def load_robot(name_or_folder: str | Path) -> RobotDescription:
-    """The description of a robot, by name or by the folder of its `robot.toml`; read once per process.
+    """The description of a robot, by its name or by the folder of its `robot.toml`; read once per process.
 
     Raises:
         InputError: unknown robot, missing file, or a file whose content does not fit.
@@ -77,7 +79,7 @@ def _load(folder: Path) -> RobotDescription:
 
 
 class _Reader:
-    """Turns the tables of one robot.toml into checked dataclasses; every error names the file."""
+    """Reads the tables of one robot.toml into checked dataclasses; every error names the file."""
 
     def __init__(self, path: Path, model: UrdfModel) -> None:
         self.path, self.model = path, model
@@ -86,7 +88,7 @@ class _Reader:
         return InputError(f"{self.path}: {text}")
 
     def robot(self, content: Table) -> RobotDescription:
-        """The whole description; InputError about the first thing that does not fit."""
+        """The whole description; InputError for the first value that does not fit."""
         self.keys(content, "robot.toml", "the file")
         arm, hand = self.group(content["arm"], "arm"), self.group(content["hand"], "hand")
         twice = set(arm.names) & set(hand.names)

@@ -1,4 +1,4 @@
-"""Collision primitives in a link's frame."""
+"""Collision primitives in the frame of a link: box, sphere, cylinder and capsule."""
 
 from __future__ import annotations
 
@@ -12,15 +12,19 @@ import torch
 from dora.geometry.rotations import quaternion_apply
 
 MERGE_TOLERANCE = 1e-6
-"""Largest difference (m) between a cylinder's end and a sphere that makes them one capsule."""
+"""Largest difference between a cylinder's end and a sphere at which both form a capsule [m]."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """One primitive: centre `position` (m) and `quaternion` (wxyz) in the link frame, and `size` (m).
+    """One collision primitive.
 
-    `size` is (half x, half y, half z) of a box, (radius,) of a sphere, (radius, half length) of a cylinder
-    or capsule. The axis of the last two is local x, as in PhysX; a capsule's half length excludes its caps.
+    Attributes:
+        kind: which primitive.
+        position: centre in the link frame [m].
+        quaternion: orientation in the link frame, wxyz.
+        size: half sides along x, y, z of a box, radius of a sphere, radius and half length of a cylinder or capsule
+            [m]. The axis of the last two is local x, as in PhysX; a capsule's half length excludes its caps.
     """
 
     kind: Literal["box", "sphere", "cylinder", "capsule"]
@@ -30,7 +34,11 @@ class Shape:
 
     @property
     def segment(self) -> np.ndarray:
-        """End points (2, 3) of the axis of a cylinder or capsule, in the link frame (m)."""
+        """End points (2, 3) of the axis of a cylinder or capsule in the link frame [m].
+
+        Raises:
+            ValueError: the primitive has no axis.
+        """
         if len(self.size) != 2:
             raise ValueError(f"a {self.kind} has no axis")
         half = torch.tensor([self.size[1], 0.0, 0.0], dtype=torch.float64)
@@ -57,7 +65,7 @@ def merge_capsules(shapes: Sequence[Shape]) -> tuple[Shape, ...]:
 
 
 def _cap(spheres: Sequence[Shape], center: np.ndarray, radius: float) -> Shape | None:
-    """The sphere of this radius at this place, if there is one."""
+    """The sphere with this centre and radius [m], if there is one."""
     for sphere in spheres:
         if np.allclose((*sphere.position, *sphere.size), (*center, radius), rtol=0.0, atol=MERGE_TOLERANCE):
             return sphere

@@ -1,4 +1,4 @@
-"""Read the parts of a URDF that Dora needs: the tree, the joints and the collision primitives."""
+"""Reading of the parts of a URDF that Dora needs: the tree, the joints and the collision primitives."""
 
 from __future__ import annotations
 
@@ -18,13 +18,24 @@ from dora.geometry.rotations import matrix_from_quaternion, quaternion_from_rpy,
 from dora.robot.shapes import Shape, merge_capsules
 
 MOVING = ("revolute", "prismatic", "continuous")
+"""Types of joints with a degree of freedom."""
 Z_TO_X = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)
-"""Turns local x (the axis of a `Shape`) into z (the axis of a URDF cylinder); quaternion wxyz."""
+"""Rotation (quaternion wxyz) of local x, the axis of a `Shape`, into z, the axis of a URDF cylinder."""
 
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """One joint: `origin` is the (4, 4) pose of the joint frame in the parent link; limits in SI units."""
+    """One joint of a URDF.
+
+    Attributes:
+        name, kind: name and type of the joint.
+        parent, child: names of the links that it connects.
+        origin: (4, 4) pose of the joint frame in the parent link [m].
+        axis: (3,) direction of the axis in the joint frame.
+        lower, upper: limits [rad], or [m] of a prismatic joint.
+        velocity: velocity limit [rad/s] or [m/s].
+        effort: limit of torque [N m] or force [N].
+    """
 
     name: str
     kind: str
@@ -67,7 +78,11 @@ class UrdfModel:
         return tuple(j.name for j in _breadth_first(self.root, self.joints.values()) if j.moves)
 
     def frame(self, link: str, tip: str) -> np.ndarray:
-        """Pose (4, 4) of `tip` in `link`, which must carry it by fixed joints; ValueError if not."""
+        """Pose (4, 4) of the link `tip` in `link`, to which fixed joints connect it [m].
+
+        Raises:
+            ValueError: `tip` is not fixed to `link`.
+        """
         joints = self.chain(tip)[len(self.chain(link)) :]
         if any(joint.moves for joint in joints) or not joints or joints[0].parent != link:
             raise ValueError(f"{tip} is not fixed to {link}")
@@ -78,7 +93,7 @@ def read_urdf(path: Path) -> UrdfModel:
     """Read a URDF file.
 
     Raises:
-        InputError: no such file, not XML, an element the tree needs is missing, a name is used twice, a
+        InputError: there is no such file, it is not XML, a required element is missing, a name is used twice, a
             lower limit exceeds its upper limit, or the links do not form one tree.
     """
     if not path.is_file():
@@ -166,12 +181,13 @@ _SIZES: dict[str, Callable[[ElementTree.Element], tuple[Literal["box", "sphere",
     "sphere": lambda e: ("sphere", (float(_text(e, "radius")),)),
     "cylinder": lambda e: ("cylinder", (float(_text(e, "radius")), float(_text(e, "length")) / 2)),
 }
+"""Kind and `Shape.size` of each geometry element."""
 
 
 def _origin(
     element: ElementTree.Element,
 ) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
-    """Position (m) and quaternion (wxyz) of an element's <origin>, the identity when it has none."""
+    """Position [m] and quaternion (wxyz) of an element's <origin>, the identity when it has none."""
     origin = element.find("origin")
     xyz = (0.0, 0.0, 0.0) if origin is None or "xyz" not in origin.attrib else _floats(origin, "xyz")
     rpy = (0.0, 0.0, 0.0) if origin is None or "rpy" not in origin.attrib else _floats(origin, "rpy")

@@ -1,7 +1,7 @@
 """Model a robot's visual meshes from a table: `python -m dora.robot.visuals robots/diana7_hit`.
 
-`visuals.yaml` lists, per mesh, parts in the link frame (m): lathed profiles, rounded cylinders, tubes along a
-spline, and convex hulls of spheres and rounded discs. Parts of one material become one smooth-shaded mesh in
+`visuals.yaml` lists the parts of each mesh in the link frame [m]: solids of revolution, rounded cylinders, tubes along
+a spline, and convex hulls of spheres and rounded discs. Parts of one material become one smooth-shaded mesh in
 `meshes/NAME.glb` with a PBR material.
 """
 
@@ -23,14 +23,15 @@ from trimesh.visual.material import PBRMaterial
 from dora.errors import InputError
 
 Row = Mapping[str, Any]
+"""One row of the table."""
 AROUND = 40
-"""Points around a circle."""
+"""Number of points around a circle."""
 ALONG = 16
-"""Cross-sections of a tube."""
+"""Number of cross-sections of a tube."""
 FILLET_STEPS = 4
-"""Straight pieces of a rounded edge."""
+"""Number of straight pieces of a rounded edge."""
 CREASE = np.radians(28.0)
-"""Edges with a larger angle (rad) between their faces are shaded as edges."""
+"""Angle between two faces above which their common edge is shaded as an edge [rad]."""
 
 
 def build_meshes(table: Row) -> dict[str, trimesh.Scene]:
@@ -47,7 +48,11 @@ def build_meshes(table: Row) -> dict[str, trimesh.Scene]:
 
 
 def write_meshes(folder: Path) -> list[Path]:
-    """Write `folder`/meshes/*.glb from `folder`/visuals.yaml and return their paths."""
+    """Write `folder`/meshes/*.glb from `folder`/visuals.yaml and return their paths.
+
+    Raises:
+        InputError: as `build_meshes`.
+    """
     scenes = build_meshes(yaml.safe_load((folder / "visuals.yaml").read_text()))
     target = folder / "meshes"
     target.mkdir(exist_ok=True)
@@ -60,7 +65,7 @@ def write_meshes(folder: Path) -> list[Path]:
 
 
 def lathe(profile: ArrayLike, at: ArrayLike, axis: ArrayLike) -> trimesh.Trimesh:
-    """Solid of revolution of `profile`, rows (radius, height) upwards, about `axis` through `at`."""
+    """Solid of revolution of `profile`, rows (radius, height) in ascending order, about `axis` through `at` [m]."""
     radius, height = np.asarray(profile, dtype=float).T
     angle = np.linspace(0, 2 * np.pi, AROUND, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -71,7 +76,7 @@ def lathe(profile: ArrayLike, at: ArrayLike, axis: ArrayLike) -> trimesh.Trimesh
 
 
 def cylinder(p0: ArrayLike, p1: ArrayLike, radius: float, edge: float = 0.0) -> trimesh.Trimesh:
-    """Cylinder from `p0` to `p1` whose two rims are rounded with radius `edge`."""
+    """Cylinder from `p0` to `p1` whose two rims are rounded with radius `edge` [m]."""
     direction = np.subtract(p1, p0)
     length = float(np.linalg.norm(direction))
     bend = np.linspace(0, np.pi / 2, FILLET_STEPS + 1)
@@ -81,7 +86,7 @@ def cylinder(p0: ArrayLike, p1: ArrayLike, radius: float, edge: float = 0.0) -> 
 
 
 def tube(points: ArrayLike, radii: ArrayLike) -> trimesh.Trimesh:
-    """Round tube along a cubic spline through `points` with the given radii there, closed by flat ends."""
+    """Round tube along a cubic spline through `points` (n, 3) with radii (n,) there, closed by flat ends [m]."""
     knots = np.asarray(points, dtype=float)
     parameter = np.r_[0.0, np.linalg.norm(np.diff(knots, axis=0), axis=1).cumsum()]
     samples = np.linspace(0, parameter[-1], ALONG)
@@ -101,7 +106,7 @@ def tube(points: ArrayLike, radii: ArrayLike) -> trimesh.Trimesh:
 
 
 def hull(of: Sequence[Row]) -> trimesh.Trimesh:
-    """Convex hull of balls {at, radius} and rounded discs {at, axis, radius, edge}."""
+    """Convex hull of balls {at, radius} and rounded discs {at, axis, radius, edge} [m]."""
     clouds = []
     for element in of:
         at, radius = np.asarray(element["at"], dtype=float), float(element["radius"])
@@ -120,10 +125,11 @@ PARTS: dict[str, Callable[..., trimesh.Trimesh]] = {
     "tube": tube,
     "hull": hull,
 }
+"""Functions that make each kind of part."""
 
 
 def _scene(parts: Sequence[Row], materials: Mapping[str, PBRMaterial]) -> trimesh.Scene:
-    """Parts grouped by material into one geometry each."""
+    """A scene with one geometry per material."""
     groups: dict[str, list[trimesh.Trimesh]] = {}
     for part in parts:
         arguments = {key: value for key, value in part.items() if key not in ("part", "material")}
@@ -141,7 +147,7 @@ def _scene(parts: Sequence[Row], materials: Mapping[str, PBRMaterial]) -> trimes
 
 
 def _shade(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Split vertices along creases, so that vertex normals are smooth elsewhere."""
+    """The mesh with vertices split along creases, so that vertex normals are smooth elsewhere."""
     return trimesh.graph.smooth_shade(mesh, angle=CREASE, facet_minarea=None)
 
 
@@ -167,7 +173,7 @@ def _frame(axis: ArrayLike) -> np.ndarray:
 
 
 def _material(name: str, row: Row) -> PBRMaterial:
-    """Opaque material; colours are given as they look (sRGB) and stored linear, as glTF asks."""
+    """Opaque material; the table's colours are sRGB, those of glTF are linear."""
     color = [*(np.asarray(row["color"], dtype=float) ** 2.2), 1.0]
     return PBRMaterial(
         name=name, baseColorFactor=color, metallicFactor=row["metallic"], roughnessFactor=row["roughness"]

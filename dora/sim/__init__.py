@@ -1,4 +1,4 @@
-"""What ManiSkill lacks: many environments in one process on a CPU, contact reading, and time measurement.
+"""Simulation on ManiSkill: batched CPU physics, contact reading, robots and objects as bodies, grasp tests.
 
 Importing this package makes ``sim_backend="physx_cpu_batch"`` known to ManiSkill, for every task:
 

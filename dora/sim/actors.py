@@ -1,4 +1,4 @@
-"""Objects with affordances as bodies of a simulation: convex pieces to collide, the mesh to look at."""
+"""Objects as bodies of a simulation: convex pieces as collision shapes, the labelled mesh as visual."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,9 +17,9 @@ from dora.errors import InputError
 from dora.sim.shapes import collision_shape
 
 CONTACT_OFFSET = 0.005
-"""Distance at which PhysX begins to look for contacts with an object [m]."""
+"""PhysX's contact offset of objects, the distance below which contacts are generated [m]."""
 ROUGHNESS = 0.5
-"""Of an object's surface in pictures, 0 to 1."""
+"""Roughness of an object's surface in pictures, 0 to 1 [1]."""
 
 
 def object_entity(
@@ -32,16 +32,16 @@ def object_entity(
 ) -> sapien.Entity:
     """A dynamic body that is in no scene yet. Its frame is the object frame.
 
-    Mass, centre of mass and inertia are the object's, whatever its pieces overlap or leave out. Every piece has a
-    material of its own, so that friction can be changed for this body alone; shape i of the body is piece i.
+    Mass, centre of mass and inertia are those of the object, independent of its pieces. Every piece has a material
+    of its own, so that friction can be changed for this body alone; shape i of the body is piece i.
 
     Args:
         obj: the object.
-        scale: factor of all lengths; mass does not follow it.
-        friction: coefficient, static and dynamic; the object's own if None.
+        scale: factor of all lengths, which does not change the mass [1].
+        friction: Coulomb coefficient, static and dynamic [1]; the object's own if None.
         mass: mass [kg]; the object's own if None.
-        contact_offset: distance at which PhysX begins to look for contacts [m].
-        visible: whether the mesh is drawn, region by region; needs a renderer.
+        contact_offset: PhysX's contact offset, the distance below which contacts are generated [m].
+        visible: whether the mesh is drawn, one shape per region; needs a renderer.
 
     Raises:
         InputError: a number is not positive, or a piece is no convex body.
@@ -75,7 +75,7 @@ def object_entity(
 
 
 def _visual(obj: AffordanceObject, scale: float) -> sapien.render.RenderBodyComponent:
-    """The mesh, one shape per region."""
+    """The mesh as visual, one shape per region."""
     component = sapien.render.RenderBodyComponent()
     for index, label in enumerate(obj.labels):
         part: trimesh.Trimesh = obj.region(label)
@@ -95,7 +95,13 @@ def _visual(obj: AffordanceObject, scale: float) -> sapien.render.RenderBodyComp
 
 
 class ObjectBuilder(ActorBuilder):
-    """ManiSkill's actor builder for an object; arguments as for `object_entity`, `visible` by what can render."""
+    """ManiSkill's actor builder for an object.
+
+    Args:
+        scene: the ManiSkill scene; the object is visible if the scene can render.
+        obj: the object.
+        settings: further arguments of `object_entity`.
+    """
 
     def __init__(self, scene: ManiSkillScene, obj: AffordanceObject, **settings: float | None):
         super().__init__()
@@ -103,7 +109,7 @@ class ObjectBuilder(ActorBuilder):
         self._object, self._settings = obj, settings
 
     def build_entity(self) -> sapien.Entity:
-        """A body for one environment."""
+        """The body for one environment, see `object_entity`."""
         return object_entity(self._object, visible=self.scene.can_render(), **self._settings)  # pyright: ignore
 
 
@@ -120,20 +126,20 @@ def build_object(
     """The object in every environment of a ManiSkill scene.
 
     Args:
-        scene: where.
-        obj: what.
-        name: name of the actor, the object's by default.
-        pose: where it is first; at rest on a table of height 0 under the origin by default.
-        scale: factor of all lengths, one for all environments or one for each.
-        friction: coefficient, static and dynamic; the object's own if None.
+        scene: the ManiSkill scene.
+        obj: the object.
+        name: name of the actor; the object's if None.
+        pose: initial pose in the world; at rest at the origin on a table of height 0 if None.
+        scale: factor of all lengths, one for all environments or one per environment [1].
+        friction: Coulomb coefficient, static and dynamic [1]; the object's own if None.
         mass: mass [kg]; the object's own if None.
         contact_offset: as in `object_entity`.
 
     Returns:
-        One actor; with a scale per environment it is merged from one per environment.
+        One actor; with a scale per environment it is merged from one actor per environment.
 
     Raises:
-        InputError: as in `object_entity`, or the scales are not as many as environments.
+        InputError: as in `object_entity`, or the number of scales is not the number of environments.
     """
     name = obj.name if name is None else name
     factors = np.broadcast_to(np.asarray(scale, float), (scene.num_envs,) if np.ndim(scale) == 0 else np.shape(scale))

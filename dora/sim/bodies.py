@@ -10,14 +10,20 @@ from mani_skill.utils.structs import Actor, Link
 from torch import Tensor
 
 POSE = slice(0, 7)
+"""Columns of position and quaternion in the rigid-body buffer."""
 VELOCITY = slice(7, 13)
+"""Columns of linear and angular velocity in the rigid-body buffer."""
 
 
 class BodyReader:
-    """Reads k bodies of each of n environments at once, world frame of each environment.
+    """Reads k bodies of each of n environments at once, in the world frame of each environment.
 
-    On batched backends a read is one gather from the rigid-body buffer; on a stock single CPU environment, one
-    read per body.
+    On batched backends a read is one gather from the rigid-body buffer, on a stock single CPU environment one read
+    per body.
+
+    Args:
+        scene: the ManiSkill scene of the bodies.
+        bodies: k actors or links.
     """
 
     def __init__(self, scene: ManiSkillScene, bodies: Sequence[Actor | Link]):
@@ -25,20 +31,20 @@ class BodyReader:
         self._index: Tensor | None = None
 
     def poses(self) -> Float[Tensor, "n k 7"]:
-        """Position [m], quaternion wxyz."""
+        """Positions [m] and quaternions wxyz, in the order of `bodies`."""
         if self.scene.gpu_sim_enabled:
             return self._gather(POSE)
         return torch.stack([b.pose.raw_pose for b in self.bodies], 1)
 
     def velocities(self) -> Float[Tensor, "n k 6"]:
-        """Linear [m/s] and angular velocity [rad/s]."""
+        """Linear [m/s] and angular [rad/s] velocities, in the order of `bodies`."""
         if self.scene.gpu_sim_enabled:
             return self._gather(VELOCITY)
         parts = [torch.cat([b.get_linear_velocity(), b.get_angular_velocity()], -1) for b in self.bodies]
         return torch.stack(parts, 1)
 
     def _gather(self, columns: slice) -> Tensor:
-        if self._index is None:  # bodies have no rows before the scene is complete
+        if self._index is None:  # bodies have no rows until the scene is complete
             self._index = torch.stack([torch.as_tensor(b._body_data_index) for b in self.bodies], 1).long()
         system: Any = self.scene.px  # PhysX's GPU system or BatchSystem
         return system.cuda_rigid_body_data.torch()[self._index, columns]

@@ -1,4 +1,4 @@
-"""Contacts between groups of bodies, read once per control step."""
+"""Reading of contacts between groups of bodies: impulses, separations and contact points."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,10 +20,11 @@ class Contacts:
     """Contacts among g groups of bodies in n environments.
 
     Attributes:
-        impulse: sum over contact points of the impulse on group i by group j [N s], world frame. Antisymmetric in
-            the groups; contacts inside a group add up to 0.
-        separation: smallest distance over the contact points of two groups [m]: negative is penetration, +inf means
-            that PhysX reports no contact between them. Symmetric. NaN on a GPU, which does not report it.
+        impulse: (n, g, g, 3) sum over contact points of the impulse on group i by group j in the world frame [N s].
+            Antisymmetric in the groups; contacts inside a group add up to 0.
+        separation: (n, g, g) smallest separation over the contact points of two groups [m]; negative values are
+            penetration depths, +inf means that PhysX reports no contact. Symmetric. NaN on a GPU, which does not
+            report it.
     """
 
     impulse: Float[Tensor, "n g g 3"]
@@ -37,19 +38,19 @@ class ContactMonitor:
     queries, on a GPU (impulses only; not tested). The order of the groups in `Contacts` is that of
     ``groups``.
 
-    PhysX reports the contacts of the last physics step only. To catch blows that are shorter than a control
-    step, let the monitor collect those of every physics step and `take` them once per control step.
+    PhysX reports the contacts of the last physics step only. To detect impacts that are shorter than a control
+    step, let the monitor collect the contacts of every physics step and `take` them once per control step.
 
     Args:
-        scene: the ManiSkill scene of the bodies; make a new monitor after a reconfiguration.
+        scene: the ManiSkill scene of the bodies; a reconfiguration requires a new monitor.
         groups: actors or links by the name of their group. A body may be in one group only.
-        pairs: names of the two groups of every pair that matters, in any order; all pairs by default. Points of
-            other pairs are not even looked at, which is most of the cost of a hand full of fingers.
-        located: those of the pairs whose contact points `points` gives; none by default. A pair is (group, other).
-        every_step: collect the contacts of every physics step for `take`. Not on a GPU.
+        pairs: names of the two groups of every pair that is read, in any order; all pairs by default. Contact points
+            of other pairs are skipped, which saves most of the cost for a hand.
+        located: pairs (group, other) whose contact points `points` returns; none by default.
+        every_step: whether to collect the contacts of every physics step for `take`. Not on a GPU.
 
     Raises:
-        InputError: if a body is in two groups, or a pair names an unknown group.
+        InputError: a body is in two groups, or a pair names an unknown group.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class ContactMonitor:
         return scanner.result() if scanner else self._read_gpu()
 
     def _scanned(self) -> "_GroupScanner | None":
-        """The scanner, having seen the contacts of the last physics step; None on a GPU."""
+        """The scanner after it has scanned the contacts of the last physics step; None on a GPU."""
         if self._scanner and isinstance(self._scene, BatchScene):
             self._scene.px.stepper.scan_contacts(self._scanner)
         elif self._scanner:
@@ -97,11 +98,11 @@ class ContactMonitor:
         """Contact points of the located pairs in the last physics step that carry an impulse.
 
         Args:
-            count: k, rows for every environment; further points are left out.
+            count: k, number of rows per environment; further points are left out.
 
         Returns:
-            Positions [m], world frame, and the index of the pair's first group; -1 in empty rows, which stand last.
-            Empty on a GPU.
+            Positions in the world frame [m], and the index of the pair's first group, -1 in empty rows, which come
+            last. On a GPU all rows are empty.
         """
         if scanner := self._scanned():
             return scanner.points(count)
@@ -109,9 +110,9 @@ class ContactMonitor:
         return torch.zeros(environments, count, 3), torch.full((environments, count), -1)
 
     def take(self) -> Contacts:
-        """Contacts since the last `take`: impulses summed, separations minimal over the physics steps.
+        """Contacts since the last `take`: sums of impulses and smallest separations over the physics steps.
 
-        Unless the monitor collects every step, these are the contacts of the last one.
+        Without `every_step` these are the contacts of the last physics step.
         """
         if self._collector is None:
             return self.read()
@@ -132,7 +133,7 @@ class ContactMonitor:
 
 
 def _wanted(names: tuple[str, ...], pairs: Iterable[tuple[str, str]] | None) -> list[bool]:
-    """Per (first, second) group in one flat list: whether contacts between them matter."""
+    """Flat list over pairs (first, second) of groups: whether contacts between them are read."""
     count = len(names)
     if pairs is None:
         return [True] * count**2
@@ -146,7 +147,7 @@ def _wanted(names: tuple[str, ...], pairs: Iterable[tuple[str, str]] | None) -> 
 
 
 def _places(names: tuple[str, ...], located: Iterable[tuple[str, str]]) -> list[int]:
-    """Per (first, second) group in one flat list: the located group of the two, or -1 if they are not located."""
+    """Flat list over pairs (first, second) of groups: the index of the located group, -1 if the pair is not located."""
     places = [-1] * len(names) ** 2
     for one, other in located:
         first, second = names.index(one), names.index(other)
@@ -167,7 +168,7 @@ def _gpu_pairs(groups: Mapping[str, Sequence[Any]], wanted: Sequence[bool]) -> l
 
 
 class _GroupScanner(ContactScanner):
-    """Collects points between bodies of groups; adds them up only when the result is wanted."""
+    """Collects contact points between bodies of groups; sums them up only when the result is asked for."""
 
     def __init__(
         self,
@@ -181,7 +182,7 @@ class _GroupScanner(ContactScanner):
         self._count = len(groups)
         self._group_of: dict[int, int] = {}
         members = [member for group in groups.values() for member in group]
-        self._kept_alive = [body for member in members for body in member._bodies]  # an id may be used anew otherwise
+        self._kept_alive = [body for member in members for body in member._bodies]  # ids stay unique
         for index, (name, group) in enumerate(groups.items()):
             for member in group:
                 if any(self._group_of.setdefault(id(body), index) != index for body in member._bodies):
@@ -189,7 +190,7 @@ class _GroupScanner(ContactScanner):
         self.clear()
 
     def clear(self) -> None:
-        """Forget all points."""
+        """Drop all collected points."""
         self._slots: list[int] = []
         self._impulses: list[np.ndarray] = []
         self._separations: list[float] = []
@@ -198,7 +199,7 @@ class _GroupScanner(ContactScanner):
         self._positions: list[np.ndarray] = []
 
     def take(self, environment: int, contacts: list) -> None:
-        """Collect the points between groups: slot (environment, first, second), impulse on the first, separation."""
+        """Collect the points between groups: index of (environment, first, second), impulse on first, separation."""
         group_of, count, wanted = self._group_of.get, self._count, self._wanted
         for contact in contacts:
             first, second = contact.bodies
@@ -223,7 +224,7 @@ class _GroupScanner(ContactScanner):
                     self._positions.append(point.position)
 
     def points(self, count: int) -> tuple[Tensor, Tensor]:
-        """The located points that carry an impulse, `count` rows for every environment."""
+        """The located points that carry an impulse, `count` rows per environment; see `ContactMonitor.points`."""
         shape = (len(self._readers), count)
         position, group = np.zeros((*shape, 3), np.float32), np.full(shape, -1)
         if self._point_slots:
@@ -239,7 +240,7 @@ class _GroupScanner(ContactScanner):
         return torch.from_numpy(position), torch.from_numpy(group)
 
     def result(self) -> Contacts:
-        """The points added up."""
+        """Impulses and separations of the collected points by pair of groups."""
         shape = (len(self._readers), self._count, self._count)
         impulse = np.zeros((*shape, 3), np.float32)
         separation = np.full(shape, np.inf, np.float32)

@@ -1,4 +1,4 @@
-"""Mass and friction of an actor, environment by environment."""
+"""Mass and friction of one actor, set per environment."""
 
 from collections.abc import Sequence
 
@@ -8,12 +8,16 @@ from sapien.physx import get_default_material
 
 
 class ObjectProperties:
-    """Writes masses (with inertia in proportion) and friction of one body per environment.
+    """Sets masses (with inertia in proportion) and friction of one body per environment.
 
-    Every shape needs a material of its own; ValueError otherwise.
+    Args:
+        actor: the actor; each of its shapes needs a material of its own.
 
     Attributes:
-        nominal: masses as built [kg], one per environment.
+        nominal: masses as built, one per environment [kg].
+
+    Raises:
+        ValueError: shapes share a material.
     """
 
     def __init__(self, actor: Actor):
@@ -26,7 +30,7 @@ class ObjectProperties:
             raise ValueError(f"the shapes of {actor.name} share a material: friction would change everywhere")
 
     def apply(self, rows: Sequence[int], mass: Sequence[float], friction: Sequence[float]) -> None:
-        """Sets the bodies of the environments `rows`; `mass` [kg] and `friction` have one value per row."""
+        """Sets the bodies of the environments `rows`; `mass` [kg] and `friction` [1] have one value per row."""
         for row, m, f in zip(rows, mass, friction, strict=True):
             body = self.bodies[row]
             body.set_mass(m)

@@ -1,4 +1,4 @@
-"""Collision shapes of PhysX from robot descriptions and objects, made in memory: no mesh files."""
+"""PhysX collision shapes of robot descriptions and objects, made in memory without mesh files."""
 
 from collections.abc import Callable
 
@@ -15,20 +15,21 @@ _PRIMITIVES: dict[str, Callable[[list[float], physx.PhysxMaterial], physx.PhysxC
     "cylinder": lambda size, material: physx.PhysxCollisionShapeCylinder(size[0], size[1], material),
     "capsule": lambda size, material: physx.PhysxCollisionShapeCapsule(size[0], size[1], material),
 }
+"""Functions that make each kind of primitive from its `Shape.size` [m] and a material."""
 
 
 def collision_shape(
     shape: Shape | trimesh.Trimesh, material: physx.PhysxMaterial, scale: float = 1.0
 ) -> physx.PhysxCollisionShape:
-    """One PhysX shape.
+    """One PhysX collision shape.
 
     Args:
         shape: a primitive, or a mesh whose convex hull is used, in the frame of the body [m].
         material: friction and restitution.
-        scale: factor of all lengths.
+        scale: factor of all lengths [1].
 
     Raises:
-        RuntimeError: PhysX cannot make a convex body of the mesh (it is flat, for example).
+        RuntimeError: PhysX cannot make a convex body of the mesh, for example because it is flat.
     """
     if isinstance(shape, trimesh.Trimesh):
         points = np.asarray(shape.vertices * scale, np.float32)

@@ -1,4 +1,4 @@
-"""Being called after every physics step, which on the batched back end are many per call of `step`."""
+"""Callbacks after every physics step, also on the batched back end, which makes many steps per call of `step`."""
 
 from collections.abc import Callable
 
@@ -8,13 +8,12 @@ from dora.sim.batch.scene import BatchScene
 
 
 def watch_physics(scene: ManiSkillScene, watch: Callable[[int], None]) -> None:
-    """Calls `watch` with the number of an environment after each physics step of that environment.
-
-    It may read and write SAPIEN's objects of that environment directly, and is forgotten with the scene.
+    """Registers a function that is called after each physics step of each environment, for the life of the scene.
 
     Args:
         scene: the scene of all environments, on a CPU (single or batched).
-        watch: called with 0 on a single environment.
+        watch: called with the index of the environment, 0 on a single one. It may read and write SAPIEN's objects of
+            that environment directly.
     """
     if isinstance(scene, BatchScene):
         scene.px.stepper.watchers.append(watch)

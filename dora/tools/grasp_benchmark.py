@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dora.affordance.hand.hand_model import HandModel
-from dora.affordance.hand.protocol import pregrasp, squeeze
+from dora.affordance.hand.postures import pregrasp, squeeze
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.objects.signed_distance import CHANNELS, SignedDistanceField
@@ -30,7 +30,7 @@ from dora.affordance.search.energies import GraspEnergy
 from dora.affordance.search.initial_poses import InitialPoses
 from dora.affordance.search.native.parts import PARTS, repeat
 from dora.affordance.search.optimise import optimise, seated, table_of
-from dora.affordance.search.quasi_static_closing import hold
+from dora.affordance.search.quasi_static_closing import close_hand
 from dora.affordance.search.search import Search, Settings
 from dora.robot import RobotDescription
 
@@ -137,7 +137,7 @@ def measure(name: str, robot: RobotDescription, settings: Settings | None = None
 
     Args:
         name: one of `available_objects`; what its task wants held is the region.
-        robot: whose hand it is.
+        robot: the robot whose hand grasps.
         settings: of the search.
 
     Raises:
@@ -219,7 +219,7 @@ def _stages(obj: AffordanceObject, search: Search) -> dict[str, float]:
 
     def judge(rows: Rows) -> None:
         full = robot.expand_hand(rows.joints)
-        hold(energy, rows.wrist, pregrasp(robot, full), squeeze(robot, full), obj.mass, wanted=wanted)
+        close_hand(energy, rows.wrist, pregrasp(robot, full), squeeze(robot, full), obj.mass, wanted=wanted)
 
     wanted = round(settings.batch / settings.oversampling)
     seconds = {

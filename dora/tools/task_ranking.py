@@ -23,7 +23,7 @@ from dora.tasks import find_task, make_task, task_ids
 from dora.tasks.env.env import DoraEnv
 
 FIRST_TRIES, MORE_TRIES = 6, 30
-"""Episodes per grasp of a proof that makes a bundled set: of all grasps, then of the better ones."""
+"""Episodes per grasp of a ranking that makes a bundled set: of all grasps, then of the better ones."""
 BETTER = 0.2
 """Share of them that is tried again."""
 BATCH = 64
@@ -133,10 +133,10 @@ def _executed(task: DoraEnv, seed: int) -> Bool[Tensor, " n"]:
     return info["success"] & ~failed & (task.memory.max_penetration <= CLEAN * task.config.penetration_limit)
 
 
-def ranked(candidates: GraspCandidates, proof: TaskRanking) -> GraspCandidates:
-    """The candidates with the proof's scores, best first; among equals, those that were reached more often."""
-    order = torch.argsort(proof.score + 1e-6 * proof.tries, descending=True, stable=True)
-    return replace(candidates, score=proof.score).select(order)
+def ranked(candidates: GraspCandidates, ranking: TaskRanking) -> GraspCandidates:
+    """The candidates with the scores of a ranking, best first; among equals, those that were reached more often."""
+    order = torch.argsort(ranking.score + 1e-6 * ranking.tries, descending=True, stable=True)
+    return replace(candidates, score=ranking.score).select(order)
 
 
 def usable_in_task(name: str | Path) -> Callable[[GraspCandidates], Bool[Tensor, " c"]] | None:

@@ -1,1 +1,1 @@
-"""The hand as geometry: kinematics, capsules, meshes and the postures around a grasp."""
+"""The hand as geometry: kinematics, capsules, meshes, postures around a grasp, and the numbers of the grasp test."""

@@ -1,6 +1,6 @@
-"""The hand's collision shapes as capsules, spheres on their axes, and points with normals on palmar sides.
+"""The hand's collision shapes as capsules, as spheres on their axes, and as points with normals on the palmar side.
 
-All of it is computed once per robot, in numpy, in the frames of the bodies of `dora.affordance.hand.hand_model`.
+Everything is computed once per robot, in NumPy, in the frames of the bodies of `dora.affordance.hand.hand_model`.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import Shape
 
 SAGITTA = 6e-4
-"""Deepest groove (m) between neighbouring spheres on a capsule's axis."""
+"""Largest depth of the groove between neighbouring spheres on a capsule's axis [m]."""
 PALMAR_COSINE = 0.6
-"""Contact points have normals within this cosine of the palmar direction of their link."""
+"""Smallest cosine between a contact point's normal and the palmar direction of its link [1]."""
 SAMPLE_DENSITY = 1e6
-"""Surface samples per square metre from which contact points are chosen."""
+"""Density of surface samples from which contact points are chosen [1/m^2]."""
 BURIED = -2e-4
-"""A surface sample deeper than this (m) in another shape of the straight hand is no contact point."""
+"""Signed distance to another shape of the straight hand below which a surface sample is no contact point [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Capsule:
-    """Points within `radius` (m) of the segment from `start` to `end` (3,) in the frame of `body`."""
+    """The points within `radius` [m] of the segment from `start` (3,) to `end` (3,), in the frame of `body` [m]."""
 
     body: int
     link: str
@@ -37,28 +37,28 @@ class Capsule:
     radius: float
 
     def spheres(self, sagitta: float = SAGITTA) -> np.ndarray:
-        """Centres (n, 3) on the axis so close that the spheres' union is nowhere `sagitta` (m) thinner."""
+        """Centres (n, 3) of spheres on the axis whose union is at most `sagitta` [m] thinner than the capsule [m]."""
         length = float(np.linalg.norm(self.end - self.start))
         spacing = 2 * math.sqrt(sagitta * (2 * self.radius - sagitta))
         count = math.ceil(length / spacing) + 1 if length > 0 else 1
         return np.linspace(self.start, self.end, count)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance (n,) in m of points (n, 3) to the surface."""
+        """Signed distance (n,) of points (n, 3) to the surface, negative inside [m]."""
         return np.linalg.norm(points - self.nearest(points), axis=1) - self.radius
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
-        """Nearest points (n, 3) of the axis."""
+        """Points (n, 3) of the axis that are nearest to points (n, 3) [m]."""
         axis = self.end - self.start
         share = (points - self.start) @ axis / max(float(axis @ axis), 1e-18)
         return self.start + np.clip(share, 0.0, 1.0)[:, None] * axis
 
 
 def capsules_of(shape: Shape, body: int, link: str, pose: np.ndarray) -> list[Capsule]:
-    """A shape of `link` as capsules inside it; `pose` (4, 4) places the link in its body.
+    """A collision shape of `link` as inscribed capsules; `pose` (4, 4) is that of the link in its body [m].
 
-    Exact for capsules and spheres. A cylinder becomes the longest capsule inside it, a box a row of capsules
-    along its longest side with its smallest half side as radius: only their edges are rounded off.
+    Exact for capsules and spheres. A cylinder becomes the longest capsule inside it; a box becomes a row of capsules
+    along its longest side, with its smallest half side as radius. Only the edges are lost.
     """
     turn = pose[:3, :3] @ matrix_from_quaternion(torch.tensor(shape.quaternion, dtype=torch.float64)).numpy()
     center = pose[:3, :3] @ np.asarray(shape.position) + pose[:3, 3]
@@ -88,10 +88,13 @@ def palmar_points(
     """Up to `count` evenly spread points (n, 3) and outward unit normals (n, 3) on the palmar side of one body.
 
     Args:
-        capsules: all capsules of the body; points buried in one of them are left out.
-        palmar: unit direction (3,) that the body's inner side faces, in the body's frame.
-        count: number of points wanted.
-        tip: direction (3,) in which the finger ends there; normals may lean towards it.
+        capsules: all capsules of the body; points inside another of them are left out.
+        palmar: (3,) unit normal of the palmar side, in the body's frame.
+        count: largest number of points.
+        tip: (3,) unit direction towards the fingertip for the last link, towards which normals may lean; else None.
+
+    Returns:
+        Points and normals, in the body's frame [m].
     """
     facing = palmar if tip is None else (palmar + 0.5 * tip) / np.linalg.norm(palmar + 0.5 * tip)
     found_points, found_normals = [], []
@@ -109,7 +112,7 @@ def palmar_points(
 
 
 def _surface(capsule: Capsule) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) and normals (n, 3) on the surface of a capsule, the same at every call."""
+    """Points (n, 3) [m] and normals (n, 3) on the surface of a capsule, sampled with a fixed seed."""
     axis = capsule.end - capsule.start
     length = float(np.linalg.norm(axis))
     mesh = trimesh.creation.capsule(height=length, radius=capsule.radius, count=[16, 16])
@@ -125,7 +128,7 @@ def _surface(capsule: Capsule) -> tuple[np.ndarray, np.ndarray]:
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices (min(count, n),) of points chosen one by one, each farthest from those before; starts at 0."""
+    """Indices (min(count, n),) of points (n, 3) by farthest-point sampling, which starts at index 0."""
     chosen = [0]
     distance = np.linalg.norm(points - points[0], axis=1)
     while len(chosen) < min(count, len(points)):

@@ -1,4 +1,4 @@
-"""The hand as triangles: what every link looks like, and where it is in a posture. For pictures and pages only."""
+"""The hand as coloured triangle meshes and their poses in a posture; for pictures and pages only."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import RobotDescription, SerialChain
 
 GAMMA = 2.2
-"""Exponent between the linear colours of a glTF material and what a screen shows."""
+"""Exponent between the linear colours of a glTF material and the colours of a screen [1]."""
 PLAIN = (0.55, 0.57, 0.6)
 """Colour of a link that has no visual mesh, red, green and blue in 0..1."""
 
@@ -28,7 +28,7 @@ class HandMesh:
     """Meshes of the wrist and every finger link of a robot, in the link frames [m].
 
     Args:
-        robot: a robot; a link without visual meshes shows its collision shapes.
+        robot: the robot; a link without visual meshes shows its collision shapes.
 
     Attributes:
         links: face-coloured mesh by link name.
@@ -50,7 +50,7 @@ class HandMesh:
         self.links = {name: mesh for name in names if (mesh := _link_mesh(robot, name, visuals)) is not None}
 
     def poses(self, joints: Float[Tensor, "c j"]) -> dict[str, Float[Tensor, "c 4 4"]]:
-        """Pose of every link of `links` in the wrist frame at hand joints [rad] in the robot's order."""
+        """Pose of every link of `links` in the wrist frame [m] at hand joints [rad], in the order of `robot.hand`."""
         q = joints.to(torch.float64)
         found = {self._wrist: torch.eye(4, dtype=torch.float64).expand(len(q), 4, 4)}
         for chain, children, index in self._fingers:
@@ -60,7 +60,7 @@ class HandMesh:
     def world_poses(
         self, position: Float[Tensor, "c 3"], quaternion: Float[Tensor, "c 4"], joints: Float[Tensor, "c j"]
     ) -> dict[str, Float[Tensor, "c 4 4"]]:
-        """The same in the frame in which the wrist has the given poses ([m], wxyz)."""
+        """Pose of every link of `links` in the frame in which the wrist poses ([m], wxyz) are given."""
         wrist = torch.eye(4, dtype=torch.float64).repeat(len(joints), 1, 1)
         wrist[:, :3, :3] = matrix_from_quaternion(quaternion.to(torch.float64))
         wrist[:, :3, 3] = position
@@ -78,12 +78,12 @@ class HandMesh:
 
     @property
     def fingers(self) -> Bool[np.ndarray, " f"]:
-        """Which faces of `posed` are fingers', not the wrist's link."""
+        """Mask of the faces of a mesh of `posed` that belong to fingers, not to the wrist link."""
         return np.concatenate([np.full(len(mesh.faces), name != self._wrist) for name, mesh in self.links.items()])
 
 
 def joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """One mesh with the faces and the face colours of all."""
+    """One mesh with all faces and face colours of several meshes."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     return trimesh.Trimesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
@@ -94,12 +94,12 @@ def joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 
 def face_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "f 4"]:
-    """Red, green, blue and opacity of every face of a mesh that has colours, not textures."""
+    """Red, green, blue and opacity, 0 to 255, of every face of a mesh with colours (not textures)."""
     return np.asarray(cast(ColorVisuals, mesh.visual).face_colors)
 
 
 def _visual_files(robot: RobotDescription) -> dict[str, list[Path]]:
-    """Files of the visual meshes of each link of the URDF; their origins are the link frames."""
+    """Files of the visual meshes of each link of the URDF; meshes are in the link frames."""
     files = {}
     for link in ElementTree.parse(robot.urdf).getroot().findall("link"):
         meshes = link.findall("visual/geometry/mesh")
@@ -115,7 +115,7 @@ def _link_mesh(robot: RobotDescription, link: str, visuals: dict[str, list[Path]
 
 @cache
 def _coloured(path: Path) -> tuple[trimesh.Trimesh, ...]:
-    """Geometries of a mesh file with one colour each, as it looks on a screen."""
+    """Geometries of a mesh file, each in the one colour that a screen shows."""
     parts = []
     for part in cast(list[trimesh.Trimesh], trimesh.load_scene(path).dump()):
         factor = getattr(getattr(part.visual, "material", None), "baseColorFactor", None)

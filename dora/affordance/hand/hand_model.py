@@ -1,8 +1,8 @@
-"""The hand of any robot folder as batched tensors: kinematics, capsules, spheres and contact points.
+"""The hand of any robot folder as batched tensors: forward kinematics, capsules, spheres and contact points.
 
-Bodies are the wrist link (body 0, with all links fixed to it) and, finger by finger, the link behind every
+Bodies are the wrist link (body 0, with all links fixed to it) and, finger by finger, the child link of every
 moving joint. All fingers are evaluated at once as chains of equal length; shorter ones are padded with
-joints that do not move. The parameters are the actuated joints: coupled ones follow by `Coupling`.
+fixed joints. The parameters are the actuated joints; coupled joints follow by `Coupling`.
 """
 
 from __future__ import annotations
@@ -24,15 +24,19 @@ from dora.robot.urdf import UrdfJoint
 PALM = 1
 """Contact class of the palm; 0 is no contact, and finger i of the robot is i + 2."""
 POINTS_PER_LINK = 24
-"""Contact points on each finger link."""
+"""Number of contact points on each finger link."""
 POINTS_ON_PALM = 40
-"""Contact points on the palm."""
+"""Number of contact points on the palm."""
 
 
 class Points:
-    """Points fixed to bodies: `body` (p,), ascending, and `local` (p, 3) in m in the frame of that body.
+    """p points fixed to bodies, stored as one matrix for the wrist and one per finger for batched placement.
 
-    They are stored as one matrix for the wrist and one per finger, which place all their points at once.
+    Args:
+        body: (p,) index of the body of each point, ascending.
+        local: (p, 3) position in the frame of that body [m].
+        fingers: number of fingers.
+        depth: number of joints per finger, padding included.
     """
 
     def __init__(self, body: Int[Tensor, " p"], local: Float[Tensor, "p 3"], fingers: int, depth: int) -> None:
@@ -46,15 +50,15 @@ class Points:
         blocks = local.new_zeros(fingers, depth, 4, int(counts.max()))
         blocks[finger, level, :, column] = homogeneous[fixed:]
         self.on_fingers = blocks.flatten(1, 2)
-        """(fingers, 4 depth, points of the finger with most of them)"""
+        """(fingers, 4 depth, n) homogeneous coordinates, n the largest number of points on a finger."""
         place = finger * blocks.shape[-1] + column
         self.columns = None if len(place) == fingers * blocks.shape[-1] else place
-        """Columns in use if fingers have different numbers of points."""
+        """(p,) indices of the columns in use if fingers have different numbers of points, else None."""
 
 
 @dataclass(frozen=True, eq=False)
 class PalmFrame:
-    """How the open hand faces, unit vectors (3,) in the wrist frame, and `center` (3,) in m on the palm.
+    """Axes of the open hand as unit vectors (3,) in the wrist frame, and `center` (3,), a point on the palm [m].
 
     `normal` points out of the palm, `along` from the palm to the fingers, `across` = along x normal.
     """
@@ -76,10 +80,11 @@ class HandModel:
     Attributes:
         links: name of the link of every body; padding bodies repeat the last link of their finger.
         part: (bodies,) contact class of every body: `PALM`, or 2 + index of the finger.
-        lower, upper: (actuated,) limits in rad that also keep coupled joints within theirs.
-        capsules: all collision shapes; `pairs` (q, 2) are those that may collide with each other.
-        spheres, sphere_radius: spheres on the capsules' axes, for penetration.
-        contacts, contact_normal: points (p, 3) and outward normals (p, 3) on palmar sides, in body frames.
+        lower, upper: (actuated,) limits that also keep coupled joints within theirs [rad].
+        capsules: all collision shapes; `pairs` (q, 2) are indices of those that may collide with each other.
+        spheres, sphere_radius: s spheres on the capsules' axes, for penetration, and their radii (s,) [m].
+        contacts, contact_normal: p points and outward normals (p, 3) on palmar sides, in body frames.
+        palm_frame: axes and centre of the palm in the wrist frame.
 
     Raises:
         InputError: the robot has no finger, or a finger has a joint that is not revolute.
@@ -139,7 +144,7 @@ class HandModel:
         self.joint_gain, self.joint_offset = self._tensor(gain).flatten(0, 1), self._tensor(offset).flatten()
         self.joint_lower, self.joint_upper = self._tensor(lower).flatten(), self._tensor(upper).flatten()
         self.joint_index = self._index(index).flatten()
-        """(joints,) index in the order of `RobotDescription.hand`; 0 for padding, which turns nothing."""
+        """(joints,) index in the order of `RobotDescription.hand`; 0 for padding, whose joints do not move."""
         low, high = _actuated_limits(gain, offset, lower, upper)
         self.lower, self.upper = self._tensor(low), self._tensor(high)
 
@@ -154,7 +159,7 @@ class HandModel:
         self.part = self._index([PALM, *(finger + PALM + 1)])
         above = (finger[:, None] == finger) & (level[:, None] >= level)
         self._above = self._tensor(np.concatenate([np.zeros((1, len(finger))), above]))
-        """(bodies, joints): 1 where the joint moves the body."""
+        """(bodies, joints) 1 where the joint moves the body, else 0."""
 
     def _build_shapes(self) -> None:
         capsules = [
@@ -171,7 +176,7 @@ class HandModel:
         self.spheres, self.sphere_radius = self.sphere_set()
 
     def sphere_set(self, **density: float) -> tuple[Points, Float[Tensor, " s"]]:
-        """Spheres covering the capsules, with their radii (m); `density` as of `Capsule.spheres`."""
+        """Spheres that cover the capsules, and their radii (s,) [m]; `density` as for `Capsule.spheres`."""
         centers = [capsule.spheres(**density) for capsule in self.capsules]
         counts = [len(points) for points in centers]
         body = np.repeat([capsule.body for capsule in self.capsules], counts)
@@ -215,7 +220,7 @@ class HandModel:
         self.palm_frame = PalmFrame(normal, finger, np.cross(finger, normal), center)
 
     def forward(self, wrist: Float[Tensor, "c 4 4"], actuated: Float[Tensor, "c a"]) -> Float[Tensor, "c b 4 4"]:
-        """Poses of all bodies in the frame in which `wrist` is given; `actuated` joints in rad."""
+        """Forward kinematics: poses of all bodies in the frame of `wrist` [m] at the actuated joints [rad]."""
         angle = self.all_joints(actuated).unflatten(-1, (self.fingers, self.depth))[..., None, None]
         local = torch.addcmul(self.constant, self.cosine, angle.cos()).addcmul_(self.sine, angle.sin())
         pose = wrist[:, None]
@@ -226,11 +231,11 @@ class HandModel:
         return torch.cat((wrist[:, None], torch.stack(found, 2).flatten(1, 2)), 1)
 
     def all_joints(self, actuated: Float[Tensor, "c a"]) -> Float[Tensor, "c j"]:
-        """Angles (rad) of all joints, finger by finger from the palm outwards, padding included as 0."""
+        """Angles of all j joints, finger by finger from the palm outwards, 0 for padding [rad]."""
         return torch.addmm(self.joint_offset, actuated, self.joint_gain.T)
 
     def place(self, poses: Float[Tensor, "c b 4 4"], points: Points) -> Float[Tensor, "c p 3"]:
-        """Points in the frame of `poses` (m)."""
+        """Positions of points fixed to bodies, in the frame of `poses` [m]."""
         count = len(poses)
         rows = poses[:, 1:, :3].unflatten(1, (self.fingers, self.depth)).permute(1, 0, 3, 2, 4)
         found = torch.bmm(rows.reshape(self.fingers, 3 * count, -1), points.on_fingers)
@@ -242,15 +247,16 @@ class HandModel:
     def pull_back(
         self, poses: Float[Tensor, "c b 4 4"], wrench: Float[Tensor, "c b 6"]
     ) -> tuple[Float[Tensor, "c 6"], Float[Tensor, "c a"]]:
-        """Generalised forces of wrenches on the bodies: the principle of virtual work, J^T w.
+        """Generalised forces of wrenches on the bodies by the principle of virtual work, J^T w.
 
         Args:
-            poses: of `forward`.
-            wrench: force (N) and moment about the origin of the frame of `poses` (N m), per body. With
+            poses: (c, b, 4, 4) poses of the bodies, as from `forward`.
+            wrench: (c, b, 6) force [N] and moment [N m] about the origin of the frame of `poses`, per body. With
                 dE/dp as force on every point p the results are the gradient of E.
 
         Returns:
-            Force and moment about the wrist's origin on the wrist, and torques of the actuated joints.
+            Force [N] on the wrist and moment [N m] about its origin (c, 6), in the frame of `poses`, and torques
+            (c, a) of the actuated joints [N m].
         """
         total = wrench.sum(1)
         moment = total[:, 3:] - torch.linalg.cross(poses[:, 0, :3, 3], total[:, :3])
@@ -264,7 +270,7 @@ class HandModel:
 def _actuated_limits(
     gain: np.ndarray, offset: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The widest ranges of the actuated joints that keep every joint gain q + offset within its limits."""
+    """Widest ranges (a,) of the actuated joints q that keep every joint gain q + offset within its limits [rad]."""
     low, high = np.full(gain.shape[-1], -np.inf), np.full(gain.shape[-1], np.inf)
     for place in zip(*np.nonzero(gain), strict=True):
         bounds = [(bound[place[:2]] - offset[place[:2]]) / gain[place] for bound in (lower, upper)]
@@ -274,7 +280,7 @@ def _actuated_limits(
 
 
 def _places(robot: RobotDescription, links: tuple[str, ...]) -> dict[str, tuple[int, np.ndarray]]:
-    """Body and pose (4, 4) in it of every link of the hand, links on fixed joints included."""
+    """Index of the body of every link of the hand, and the link's pose (4, 4) in that body [m]."""
     above = {joint.child: joint for joint in robot.model.joints.values()}
     places = {}
     for link in robot.model.links:
@@ -287,7 +293,7 @@ def _places(robot: RobotDescription, links: tuple[str, ...]) -> dict[str, tuple[
 
 
 def _colliding(robot: RobotDescription, capsules: tuple[Capsule, ...]) -> list[tuple[int, int]]:
-    """Pairs of capsules of links that the robot's collision table lets collide."""
+    """Pairs of indices of capsules whose links may collide by the robot's description."""
     return [
         (i, j)
         for i, a in enumerate(capsules)
@@ -297,7 +303,7 @@ def _colliding(robot: RobotDescription, capsules: tuple[Capsule, ...]) -> list[t
 
 
 def _outside_others(capsules: tuple[Capsule, ...], poses: np.ndarray, body: int, points: np.ndarray) -> np.ndarray:
-    """Which points (n, 3) of a body stick out of all other bodies at the given poses (bodies, 4, 4)."""
+    """Mask (n,) of the points (n, 3) of a body that are outside all other bodies at the poses (bodies, 4, 4)."""
     free = np.ones(len(points), dtype=bool)
     for other in capsules:
         if other.body != body:
@@ -311,8 +317,8 @@ def _directions(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Palmar and lengthwise unit directions (fingers, depth, 3) of the finger links in the wrist frame.
 
-    Lengthwise is from a joint to the next one (or the tip), palmar the way it moves when the joint closes:
-    towards the limit that is farther from zero. Joints that coincide with the next one take its directions.
+    Lengthwise is from a joint to the next one (or to the tip). Palmar is the direction in which the link moves when
+    its joint turns towards the limit that is farther from zero. A joint at the place of the next has its directions.
     """
     palmar, along = np.zeros((2, len(chains), depth, 3))
     for finger, chain in enumerate(chains):

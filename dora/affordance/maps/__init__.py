@@ -1,1 +1,1 @@
-"""Which part of an object is where, which part a hand touches, and the vote between the two."""
+"""Affordance maps of objects, contact semantic maps of hands, and the vote for the region that a hand holds."""

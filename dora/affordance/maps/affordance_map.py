@@ -1,4 +1,4 @@
-"""The affordance map of an object: surface points with the part to which each belongs."""
+"""The affordance map of an object: surface points, each with the label of its region."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from dora.errors import InputError
 from dora.files import read_tensors, write_tensors
 
 COUNT = 4096
-"""Surface points of a map."""
+"""Default number of surface points of a map."""
 FORMAT = "dora-map 1"
 """Format and version of a file of a map."""
 CANDIDATES_PER_NEIGHBOUR, FEWEST_CANDIDATES = 6, 48
-"""Points that a cell of the table knows: this many per neighbour asked for, and at least the second."""
+"""Points stored per cell of the nearest-point table: this many per neighbour asked for, and at least the second."""
 
 
 @dataclass(frozen=True, eq=False)
 class AffordanceMap:
-    """M_Aff of the paper: P points spread evenly over a surface, each with one label. Object frame, m.
+    """M_Aff of the paper: P points spread evenly over a surface, each with one label; in the object frame.
 
     Attributes:
-        name: of the object.
-        points: (p, 3) (m).
-        normals: (p, 3) unit, outward.
-        areas: (p,) area for which each point stands (m^2).
+        name: name of the object.
+        points: (p, 3) positions [m].
+        normals: (p, 3) outward unit normals.
+        areas: (p,) area that each point represents [m^2].
         labels: (p,) index into `names`.
-        names: of the regions.
-        mesh: the surface itself (m).
+        names: names of the regions.
+        mesh: the surface [m].
         face_labels: (f,) index into `names` of every face of `mesh`.
-        digest: of the object's labelled surface.
+        digest: digest of the object's labelled surface.
     """
 
     name: str
@@ -61,9 +61,9 @@ class AffordanceMap:
         """Sample an object's surface.
 
         Args:
-            obj: object.
+            obj: the object.
             count: number of points P.
-            seed: of the random points.
+            seed: seed of the random points.
 
         Raises:
             InputError: `count` is less than the number of regions.
@@ -85,7 +85,7 @@ class AffordanceMap:
 
     @property
     def spacing(self) -> float:
-        """Typical distance (m) of neighbouring points: that of a hexagonal grid with as many per area."""
+        """Typical distance of neighbouring points: that of a hexagonal grid of equal density [m]."""
         return float((2 * self.areas.mean() / 3**0.5) ** 0.5)
 
     def label_index(self, label: str) -> int:
@@ -101,10 +101,17 @@ class AffordanceMap:
     def nearest_points(
         self, queries: Float[Tensor, "*b 3"], k: int
     ) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
-        """Distances (m), ascending, and indices of the k points nearest to each query (object frame, m); exact.
+        """The k points nearest to each query, exactly.
 
-        Quick for queries within a few spacings of the surface; others are compared with all points. The table
-        behind it is made when k is first asked for.
+        Fast for queries within a few spacings of the surface; others are compared with all points. The table for a
+        value of k is built at its first use.
+
+        Args:
+            queries: positions in the object frame [m].
+            k: number of points per query.
+
+        Returns:
+            Distances, ascending [m], and indices of the points.
 
         Raises:
             InputError: k is not in 1 .. P.
@@ -119,14 +126,14 @@ class AffordanceMap:
         return distance.view(shape), index.view(shape)
 
     def nearest(self, queries: Float[Tensor, "*b 3"], k: int) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
-        """Distances (m), ascending, and labels of the k points nearest to each query; as `nearest_points`."""
+        """Distances, ascending [m], and labels of the k points nearest to each query; as `nearest_points`."""
         distance, index = self.nearest_points(queries, k)
         return distance, self.labels[index]
 
     def region_distance(self, queries: Float[Tensor, "*b 3"], label: str) -> Float[Tensor, "*b"]:
-        """Unsigned distance (m) of queries (object frame, m) to a region's surface, interpolated on a grid.
+        """Unsigned distance [m] of queries ([m], object frame) to a region's surface, interpolated on a grid.
 
-        Differentiable; the grid behind it is made when a label is first asked for.
+        Differentiable. The grid of a region is built at its first use.
 
         Raises:
             InputError: the map has no such region.
@@ -143,11 +150,15 @@ class AffordanceMap:
         return replace(self, **moved, _tables={}, _fields={})
 
     def _tensors(self) -> dict[str, Tensor]:
-        """What moves with `to`."""
+        """The tensors that `to` moves."""
         return {name: getattr(self, name) for name in ("points", "normals", "areas", "labels")}
 
     def save(self, path: Path | str) -> None:
-        """Write a safetensors file; raises InputError if it cannot be written."""
+        """Write a safetensors file.
+
+        Raises:
+            InputError: it cannot be written.
+        """
         metadata = {"name": self.name, "names": list(self.names), "digest": self.digest}
         surface = {
             "vertices": torch.tensor(np.array(self.mesh.vertices)),

@@ -10,10 +10,10 @@ from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.objects.signed_distance import CHANNELS, SignedDistanceField
 from dora.geometry.rotations import matrix_from_quaternion
 
-TOUCH = 5e-3
-"""Distance (m) between hand and surface below which they are in contact."""
+CONTACT_DISTANCE = 5e-3
+"""Distance between hand and surface below which they are in contact [m]."""
 CHUNK = 2_000_000
-"""Point-capsule pairs measured at once, which bounds memory."""
+"""Point-capsule pairs evaluated at once; bounds the memory."""
 
 
 def contact_semantic_map(
@@ -22,17 +22,17 @@ def contact_semantic_map(
     quaternion: Float[Tensor, "c 4"],
     joints: Float[Tensor, "c j"],
     hand: HandModel,
-    touch: float = TOUCH,
+    contact_distance: float = CONTACT_DISTANCE,
 ) -> Int[Tensor, "c p"]:
-    """M_CoS(p_i) = the part of the hand whose links are nearest to p_i, or 0 if farther than `touch`.
+    """M_CoS(p_i) = the part of the hand whose links are nearest to p_i, or 0 if farther than `contact_distance`.
 
     Args:
-        points: of the object's surface (object frame, m).
-        position: of the wrist in the object frame (m).
-        quaternion: of the wrist in the object frame, wxyz.
-        joints: all hand joints (rad), in the order of `RobotDescription.hand`.
+        points: (p, 3) points of the object's surface in the object frame [m].
+        position: (c, 3) wrist in the object frame [m].
+        quaternion: (c, 4) wrist in the object frame, wxyz.
+        joints: (c, j) all hand joints, in the order of `RobotDescription.hand` [rad].
         hand: the hand.
-        touch: largest distance (m) of a contact; points inside the hand are in contact.
+        contact_distance: largest distance of a contact; points inside the hand are in contact [m].
 
     Returns:
         0 no contact, 1 palm, 2 thumb, 3 index, 4 middle, 5 ring, 6 pinky.
@@ -43,14 +43,16 @@ def contact_semantic_map(
     part = hand.part[hand.ends.body[0::2]]
     rows = max(1, CHUNK // (len(points) * len(part)))
     found = [
-        _nearest_part(points.to(hand.lower), chunk[:, 0::2], chunk[:, 1::2], hand.radius, part, touch)
+        _nearest_part(points.to(hand.lower), chunk[:, 0::2], chunk[:, 1::2], hand.radius, part, contact_distance)
         for chunk in ends.split(rows)
     ]
     return torch.cat(found)
 
 
-def _nearest_part(points: Tensor, start: Tensor, end: Tensor, radius: Tensor, part: Tensor, touch: float) -> Tensor:
-    """Contact class (c, p) of points (p, 3) among capsules with axes `start`, `end` (c, k, 3)."""
+def _nearest_part(
+    points: Tensor, start: Tensor, end: Tensor, radius: Tensor, part: Tensor, contact_distance: float
+) -> Tensor:
+    """Contact class (c, p) of points (p, 3) by the nearest of k capsules with axes from `start` to `end` (c, k, 3)."""
     axis = end - start
     square = axis.square().sum(-1).clamp_min(torch.finfo(axis.dtype).tiny)
     along = torch.einsum("pi,cki->cpk", points, axis) - (start * axis).sum(-1).unsqueeze(1)
@@ -58,19 +60,25 @@ def _nearest_part(points: Tensor, start: Tensor, end: Tensor, radius: Tensor, pa
     nearest = start.unsqueeze(1) + share.unsqueeze(-1) * axis.unsqueeze(1)
     gap = (points[:, None] - nearest).norm(dim=-1) - radius
     distance, capsule = gap.min(-1)
-    return torch.where(distance < touch, part[capsule], 0)
+    return torch.where(distance < contact_distance, part[capsule], 0)
 
 
 def hand_contacts(
-    hand: HandModel, field: SignedDistanceField, poses: Float[Tensor, "c b 4 4"], touch: float = TOUCH
+    hand: HandModel,
+    field: SignedDistanceField,
+    poses: Float[Tensor, "c b 4 4"],
+    contact_distance: float = CONTACT_DISTANCE,
 ) -> tuple[Float[Tensor, "c k 3"], Int[Tensor, "c k"]]:
-    """Contact points on the object, the nearest one of every link of the hand, and their contact classes.
+    """Points of the object that are nearest to each link of the hand, and their contact classes.
 
     Args:
         hand: the hand.
-        field: of the object.
-        poses: of `HandModel.forward`, in the object frame.
-        touch: links farther than this (m) have class 0.
+        field: distance field of the object.
+        poses: (c, b, 4, 4) poses of the bodies as from `HandModel.forward`, in the object frame [m].
+        contact_distance: distance above which a link has class 0 [m].
+
+    Returns:
+        Points in the object frame [m], one per link, and contact classes, 0 for no contact.
     """
     points = hand.place(poses, hand.contacts)
     bodies, counts = torch.unique_consecutive(hand.contacts.body, return_counts=True)
@@ -80,21 +88,23 @@ def hand_contacts(
     chosen = torch.take_along_dim(points, index.unsqueeze(-1), 1)
     value, _ = field.sample(chosen.view(-1, 3), CHANNELS)
     onto = (chosen.view(-1, 3) - value[:, :1] * value[:, 1:]).view_as(chosen)
-    touching = torch.take_along_dim(distance, index, 1) < touch
+    touching = torch.take_along_dim(distance, index, 1) < contact_distance
     return onto, torch.where(touching, hand.part[bodies], 0)
 
 
 def pressed_contacts(
     hand: HandModel, field: SignedDistanceField, poses: Float[Tensor, "c b 4 4"]
 ) -> tuple[Float[Tensor, "c k 3"], Int[Tensor, "c k"]]:
-    """Contact points on the object of every sphere of the hand that overlaps with it, and their contact classes.
-
-    Rows are filled up with points of class 0 to the largest number of contacts.
+    """Contact points of all spheres of the hand that overlap the object, and their contact classes.
 
     Args:
         hand: the hand.
-        field: of the object.
-        poses: of `HandModel.forward` of the closed hand, in the object frame.
+        field: distance field of the object.
+        poses: (c, b, 4, 4) poses of the bodies of the closed hand as from `HandModel.forward`, object frame [m].
+
+    Returns:
+        Points on the object in the object frame [m] and contact classes; k is the largest number of contacts of a
+        row, and rows with fewer are padded with points of class 0.
     """
     centers = hand.place(poses, hand.spheres)
     value, _ = field.sample(centers.flatten(0, 1), CHANNELS)
@@ -106,7 +116,7 @@ def pressed_contacts(
 
 
 def wrist_matrix(position: Float[Tensor, "c 3"], quaternion: Float[Tensor, "c 4"]) -> Float[Tensor, "c 4 4"]:
-    """Homogeneous pose of a position (m) and a quaternion (wxyz)."""
+    """Homogeneous matrix of a pose: position [m] and quaternion wxyz."""
     pose = torch.eye(4, dtype=position.dtype, device=position.device).repeat(len(position), 1, 1)
     pose[:, :3, :3] = matrix_from_quaternion(quaternion)
     pose[:, :3, 3] = position

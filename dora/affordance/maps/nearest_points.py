@@ -1,4 +1,4 @@
-"""Fast queries against a fixed set of surface points: the nearest ones, and the distance to a surface."""
+"""Fast queries against a fixed surface: the nearest of a set of points, and the distance to a mesh."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ CHUNK = 512
 class NearestTable:
     """The k nearest of P points, exactly, for queries near the points.
 
-    Space is divided into cells; each cell near a point knows the M points nearest to its centre. A query looks at
-    those M. Let c be the cell's centre and R the distance of its M-th point: every other point is at least
-    R - |q - c| away, so k results within that are the true ones. Queries for which this fails, or outside the
-    cells, are compared with all points.
+    Space is divided into cells; each cell near a point stores the M points nearest to its centre. A query q is compared
+    with the M points of its cell. Let c be the cell's centre and R the distance of its M-th point from c: every other
+    point is at least R - |q - c| from q, so k results within that distance are exact. Other queries, and those outside
+    the cells, are compared with all points.
     """
 
     CELL = 1.5
-    """Edge of a cell in spacings of the points."""
+    """Edge length of a cell in spacings of the points [1]."""
     BAND = 3.0
-    """Cells with a point within this many cell edges have a row."""
+    """Distance to the nearest point, in edge lengths, up to which a cell stores points [1]."""
     MOST_CELLS = 400_000
-    """Cells grow if there would be more."""
+    """Largest number of cells; cells grow instead."""
 
     def __init__(self, points: Float[Tensor, "p 3"], spacing: float, candidates: int):
         """Builds the table.
 
         Args:
-            points: (p, 3) (m).
-            spacing: typical distance (m) of neighbouring points.
+            points: (p, 3) positions [m].
+            spacing: typical distance of neighbouring points [m].
             candidates: M; at least the largest k, and a few times as much for speed.
         """
         self.points = points
@@ -62,7 +62,7 @@ class NearestTable:
         self.reach = torch.full_like(reach, torch.inf) if all_known else reach
 
     def query(self, queries: Float[Tensor, "b 3"], k: int) -> tuple[Float[Tensor, "b k"], Int[Tensor, "b k"]]:
-        """Distances (m), ascending, and indices of the k nearest points; k is at most `candidates`."""
+        """Distances, ascending [m], and indices of the k points nearest to queries [m]; k is at most `candidates`."""
         cell = ((queries - self.low) / self.edge).floor().long()
         inside = ((cell >= 0) & (cell < self.shape)).all(-1)
         cell = torch.where(inside[:, None], cell, 0)
@@ -85,7 +85,7 @@ class NearestTable:
 def nearest_by_comparison(
     points: Float[Tensor, "p 3"], queries: Float[Tensor, "b 3"], k: int
 ) -> tuple[Float[Tensor, "b k"], Int[Tensor, "b k"]]:
-    """Distances (m), ascending, and indices of the k nearest points, from all distances; slow and exact."""
+    """Distances, ascending [m], and indices of the k nearest points, by comparison with all; slow and exact."""
     found = [
         torch.cdist(part, points, compute_mode="donot_use_mm_for_euclid_dist").topk(k, largest=False)
         for part in queries.split(CHUNK)
@@ -96,24 +96,24 @@ def nearest_by_comparison(
 class RegionField:
     """Unsigned distance to a triangle mesh, interpolated on a grid.
 
-    A node of the grid holds the nearest point of the mesh, and its distance. Between nodes the nearest point is
-    interpolated near the mesh, where the distance has a kink, and the distance elsewhere, where the nearest point
-    can jump. Beyond the grid the nearest point is that of the nearest node.
+    A node of the grid stores the nearest point of the mesh and its distance. Near the mesh, where the distance has a
+    kink, the nearest point is interpolated between nodes; elsewhere, where the nearest point can jump, the distance is.
+    Outside the grid the nearest point is that of the nearest node.
     """
 
-    NODE = 0.004
-    """Distance of the nodes (m)."""
+    NODE_SPACING = 0.004
+    """Distance of neighbouring nodes [m]."""
     MARGIN = 0.05
-    """Room of the grid around the mesh (m)."""
+    """Margin of the grid around the mesh [m]."""
     MOST_NODES = 400_000
-    """Nodes move apart if there would be more."""
-    NEAR = 1.0
-    """Interpolated distance, in distances of the nodes, below which the nearest point is interpolated."""
+    """Largest number of nodes; their distance grows instead."""
+    POINT_BAND = 1.0
+    """Interpolated distance, in distances of nodes, below which the nearest point is interpolated instead [1]."""
 
     def __init__(self, mesh: trimesh.Trimesh, device: torch.device | str = "cpu"):
-        """Builds the grid around a mesh (m), which may be open."""
+        """Builds the grid around a mesh [m], which may be open."""
         low, high = mesh.bounds[0] - self.MARGIN, mesh.bounds[1] + self.MARGIN
-        self.node = max(self.NODE, float((high - low).prod() / self.MOST_NODES) ** (1 / 3))
+        self.node = max(self.NODE_SPACING, float((high - low).prod() / self.MOST_NODES) ** (1 / 3))
         count = np.ceil((high - low) / self.node).astype(int) + 1
         nodes = low + np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), -1).reshape(-1, 3) * self.node
         vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
@@ -124,7 +124,7 @@ class RegionField:
         self.low, self.last = self.values.new_tensor(low), torch.tensor(count - 1, device=device)
 
     def __call__(self, queries: Float[Tensor, "b 3"]) -> Float[Tensor, " b"]:
-        """Distance (m); differentiable almost everywhere."""
+        """Distance of queries in the frame of the mesh [m]; differentiable almost everywhere."""
         place = (queries - self.low) / self.node
         values = torch.nn.functional.grid_sample(
             self.values, (2 * place / self.last - 1).flip(-1)[None, None, None], align_corners=True
@@ -133,6 +133,6 @@ class RegionField:
         inside = ((place >= 0) & (place <= self.last)).all(-1)
         node = torch.minimum(place.detach().round().long().clamp(min=0), self.last)
         border = self.nearest[(node[:, 0] * (self.last[1] + 1) + node[:, 1]) * (self.last[2] + 1) + node[:, 2]]
-        near = inside & (length < self.NEAR * self.node)
+        near = inside & (length < self.POINT_BAND * self.node)
         exact = (torch.where(inside[:, None], point, border) - queries).norm(dim=-1)
         return torch.where(near | ~inside, exact, length)

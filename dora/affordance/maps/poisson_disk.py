@@ -1,4 +1,4 @@
-"""Evenly spread points on a surface."""
+"""Poisson-disk sampling: points spread evenly over a surface."""
 
 from __future__ import annotations
 
@@ -11,25 +11,31 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
 OVERSAMPLING = 5
-"""Random points drawn for every point kept."""
+"""Random points drawn per point kept."""
 AREA_SAMPLES = 32
-"""Random points per point kept, by which the areas are measured."""
+"""Random points per point kept, by which the areas are estimated."""
 EXPONENT = 8.0
-"""Exponent of the weight of a neighbour, alpha of the source."""
+"""Exponent alpha of the weight of a neighbour, as in the source [1]."""
 OPPOSITE = -0.3
-"""Points whose normals have a smaller inner product lie on different sides."""
+"""Inner product of two normals below which the points lie on different sides of a wall [1]."""
 
 
 def sample_evenly(
     mesh: trimesh.Trimesh, count: int, seed: int
 ) -> tuple[Float[np.ndarray, "p 3"], Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Exactly `count` points on a mesh, spread evenly: of many random points, the most crowded are taken away.
+    """Exactly `count` points on a mesh, spread evenly by weighted sample elimination from random points.
 
-    Weighted sample elimination: C. Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets",
-    Eurographics 2015, equations 3 to 5. The two sides of a thin wall do not crowd each other.
+    C. Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets", Eurographics 2015, equations 3 to 5.
+    Points on the two sides of a thin wall are no neighbours.
+
+    Args:
+        mesh: the surface [m].
+        count: number of points.
+        seed: seed of the random points.
 
     Returns:
-        points (m), the face of each, and the area (m^2) for which each stands; the areas sum to that of the mesh.
+        Points in the frame of the mesh [m], the face of each, and the area that each represents [m^2]; the areas sum
+        to that of the mesh.
     """
     rng = np.random.default_rng(seed)
     points, faces = trimesh.sample.sample_surface(mesh, OVERSAMPLING * count, seed=rng)[:2]
@@ -44,7 +50,7 @@ def sample_evenly(
 
 
 def _crowding(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], reach: float) -> csr_matrix:
-    """Weight (1 - distance / reach)^alpha of every pair of points on the same side of the surface."""
+    """(n, n) weights (1 - distance / reach)^alpha of pairs of points on the same side of the surface."""
     tree = KDTree(points)
     pairs = tree.query_pairs(reach, output_type="ndarray")
     first, second = pairs[np.einsum("nd,nd->n", normals[pairs[:, 0]], normals[pairs[:, 1]]) > OPPOSITE].T
@@ -54,7 +60,7 @@ def _crowding(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"
 
 
 def _eliminate(crowding: csr_matrix, count: int) -> Int[np.ndarray, " p"]:
-    """Indices of the `count` points left when the most crowded one goes, again and again."""
+    """Indices of the `count` points left when the point with the largest sum of weights is removed repeatedly."""
     weight = np.asarray(crowding.sum(axis=1)).ravel()
     left = len(weight)
     heap = [(-w, i) for i, w in enumerate(weight)]

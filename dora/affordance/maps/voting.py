@@ -1,4 +1,4 @@
-"""The paper's voting: which part of an object a hand holds, from its contacts and the affordance map."""
+"""The paper's voting: the region of an object that a hand holds, from its contacts and the affordance map."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dora.affordance.maps.affordance_map import AffordanceMap
 from dora.errors import InputError
 
 HAND_PARTS = 6
-"""Parts of a hand that vote: palm and up to five fingers, contact classes 1 to 6; class 0 is no contact."""
+"""Number of parts of a hand that vote: palm and up to five fingers, contact classes 1 to 6; class 0 is no contact."""
 NO_CONTACT = -1
 """Result of a vote without any contact."""
 
@@ -22,8 +22,11 @@ class VotingSettings:
     """Settings of the vote.
 
     Attributes:
-        neighbours: N, labels looked up per contact.
-        weights: w_f of palm, thumb, index, middle, ring and pinky.
+        neighbours: N, number of labels looked up per contact.
+        weights: w_f of palm, thumb, index, middle, ring and pinky [1].
+
+    Raises:
+        InputError: `neighbours` is below 1, or there are not six positive weights.
     """
 
     neighbours: int = 8
@@ -37,7 +40,7 @@ class VotingSettings:
 
 
 STANDARD = VotingSettings()
-"""Settings of every number in the docs."""
+"""The settings behind every number in the docs."""
 
 
 def vote(
@@ -46,7 +49,7 @@ def vote(
     finger: Int[Tensor, "b k"],
     settings: VotingSettings = STANDARD,
 ) -> Int[Tensor, " b"]:
-    """Index into `map.names` of the part that is held; -1 where there is no contact at all.
+    """Index into `map.names` of the region that is held; -1 where there is no contact.
 
     The paper's equations, with M = 6 parts of the hand (the palm counts as one):
 
@@ -54,14 +57,14 @@ def vote(
     2. A_f = mode of the union (with multiplicity) of N(p_i) over the contacts of part f;
     3. A = argmax_a sum_f w_f [A_f = a].
 
-    Parts without contact do not vote. Ties, which the paper leaves open: of labels equally frequent at one
-    part, and of labels with equal sums of weights, the one wins that is more frequent among the neighbours
-    of all contacts together; if that is equal too, the one named first in the map.
+    Parts without contact do not vote. The paper leaves ties open: among labels that are equally frequent at one part,
+    and among labels with equal sums of weights, the label wins that is more frequent among the neighbours of all
+    contacts together; if that is equal too, the label that the map names first.
 
     Args:
-        map: affordance map.
-        contacts: points in the object frame (m).
-        finger: contact class of every point: 0 none (its point is not looked at), 1 palm, 2 thumb ... 6 pinky.
+        map: affordance map of the object.
+        contacts: (b, k, 3) contact points in the object frame [m].
+        finger: (b, k) contact class of every point: 0 none (its point is ignored), 1 palm, 2 thumb ... 6 pinky.
         settings: N and the weights.
     """
     labels = len(map.names)
@@ -79,9 +82,9 @@ def vote(
     weights = torch.where(voting, counts.new_tensor(settings.weights), 0.0)
     sums = counts.new_zeros(len(counts), labels).scatter_add_(1, choice, weights)
     smallest = min(settings.weights)
-    held = (sums + preference.squeeze(1) * _TIE * smallest).argmax(-1)
-    return torch.where(voting.any(-1), held, NO_CONTACT)
+    winner = (sums + preference.squeeze(1) * _TIE * smallest).argmax(-1)
+    return torch.where(voting.any(-1), winner, NO_CONTACT)
 
 
 _TIE = 1e-3
-"""Share of the smallest weight by which all neighbours together may move a sum: it settles ties only."""
+"""Share of the smallest weight by which all neighbours together can change a sum, so that they decide ties only [1]."""

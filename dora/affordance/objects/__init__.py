@@ -1,1 +1,1 @@
-"""Objects as data: ours, those of users, and what is computed from their surfaces."""
+"""Objects as data: bundled ones, meshes of users, and their convex pieces and distance fields."""

@@ -1,4 +1,4 @@
-"""An object as data: its surface, the regions of the surface, and what physics needs."""
+"""An object as data: its labelled surface, its mass and inertia, and its convex collision shapes."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ FRICTION = 0.7
 HOME = "home"
 """Posture of the arm before a grasp where none is given."""
 DIGEST_LENGTH = 1e-7
-"""Lengths in a digest are rounded to this (m); areas and second moments to its square and fourth power."""
+"""Unit to which lengths in a digest are rounded [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """One convex collision shape in the object frame: a primitive, or a convex hull as a mesh (m).
+    """One convex collision shape in the object frame: a primitive, or a convex hull as a mesh [m].
 
     Attributes:
-        label: region that the piece carries; one of the object's labels.
-        shape: where and what it is.
+        label: region to which the piece belongs; one of the object's labels.
+        shape: the primitive with its pose, or the hull [m].
     """
 
     label: str
     shape: Shape | trimesh.Trimesh
 
     def moved(self, offset: Float[np.ndarray, " 3"]) -> Piece:
-        """The same piece, translated by `offset` (m)."""
+        """A copy of the piece, translated by `offset` (3,) [m]."""
         if isinstance(self.shape, Shape):
             x, y, z = (float(v) for v in np.asarray(self.shape.position) + offset)
             return replace(self, shape=replace(self.shape, position=(x, y, z)))
@@ -49,7 +49,7 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class AffordanceObject:
-    """A rigid object with a labelled surface. Its frame is that of its mesh (m), origin at the centre of mass.
+    """A rigid object with a labelled surface. Its frame is that of its mesh [m], with the origin at the centre of mass.
 
     Attributes:
         name: "jug", or the stem of a user's file.
@@ -58,12 +58,12 @@ class AffordanceObject:
         labels: names of the regions.
         classes: grasp class of each region, such as "HandleGrasp".
         target: region that a task wants held.
-        solid: watertight; `mesh` with its cavity filled. A hand keeps out of it.
-        mass: kg.
-        inertia: (3, 3) about the origin (kg m^2).
-        pieces: convex collision shapes; few, since physics pays for each.
-        support: height (m) of the origin above the table on which the object rests.
-        rest: orientation (wxyz) of the object frame at rest on a horizontal table.
+        solid: watertight mesh without cavities, which the hand must not enter.
+        mass: mass [kg].
+        inertia: (3, 3) about the origin [kg m^2].
+        pieces: convex collision shapes; each costs simulation time.
+        support: height of the origin above the table on which the object rests [m].
+        rest: orientation of the object frame at rest on a horizontal table, wxyz.
         digest: sha256 of the labelled surface, see `surface_digest`.
         friction: nominal coefficient, static and dynamic.
         placement: where it is before it is grasped.
@@ -110,14 +110,22 @@ class AffordanceObject:
         return self.labels.index(label)
 
     def region(self, label: str) -> trimesh.Trimesh:
-        """The surface of one region (open mesh, object frame, m); raises InputError as `label_index` does."""
+        """The surface of one region as an open mesh in the object frame [m].
+
+        Raises:
+            InputError: the object has no such region.
+        """
         faces = np.flatnonzero(self.face_labels == self.label_index(label))
         part = self.mesh.submesh([faces], append=True)
         assert isinstance(part, trimesh.Trimesh)
         return part
 
     def centroid(self, label: str) -> Float[np.ndarray, " 3"]:
-        """Area-weighted centre of a region (object frame, m); raises InputError as `label_index` does."""
+        """Area-weighted centre (3,) of a region in the object frame [m].
+
+        Raises:
+            InputError: the object has no such region.
+        """
         faces = self.face_labels == self.label_index(label)
         return np.average(self.mesh.triangles_center[faces], axis=0, weights=self.mesh.area_faces[faces])
 
@@ -136,19 +144,19 @@ def assemble(
     placement: Placement = "table",
     start_posture: str = HOME,
 ) -> AffordanceObject:
-    """An object from parts in any one frame; moves the origin to the centre of mass.
+    """An object from parts given in one common frame; moves the origin to the centre of mass.
 
     Args:
-        name: of the object.
-        mesh: watertight surface (m).
+        name: name of the object.
+        mesh: watertight surface [m].
         face_labels: (F,) index into `regions` of every face.
-        regions: label -> grasp class, in the order of the indices.
+        regions: grasp class by label, in the order of the indices.
         target: label that a task wants held.
-        weights: watertight bodies with uniform density and their masses (kg); they need not be `mesh`.
-        pieces: collision shapes.
-        solid: `mesh` without cavities, if it has one.
-        rest: orientation (wxyz) at rest on a table.
-        friction: nominal coefficient.
+        weights: watertight bodies of uniform density with their masses [kg]; they need not be `mesh`.
+        pieces: convex collision shapes.
+        solid: `mesh` without cavities; `mesh` itself if None.
+        rest: orientation at rest on a table, wxyz.
+        friction: nominal coefficient [1].
         placement: where it is before it is grasped.
         start_posture: name of the arm's posture before a grasp.
     """
@@ -175,12 +183,12 @@ def assemble(
 
 
 def moved(mesh: trimesh.Trimesh, offset: Float[np.ndarray, " 3"]) -> trimesh.Trimesh:
-    """A copy of a mesh, translated (m)."""
+    """A copy of a mesh, translated by `offset` (3,) [m]."""
     return trimesh.Trimesh(mesh.vertices + offset, mesh.faces, process=False)
 
 
 def support_height(mesh: trimesh.Trimesh, rest: tuple[float, float, float, float]) -> float:
-    """Height (m) of the origin above the lowest point of a mesh turned by the quaternion `rest` (wxyz)."""
+    """Height of the origin above the lowest point of a mesh in the orientation `rest` (wxyz) [m]."""
     turn = trimesh.transformations.quaternion_matrix(rest)[:3, :3]
     return float(-(mesh.vertices @ turn[2]).min())
 
@@ -188,10 +196,10 @@ def support_height(mesh: trimesh.Trimesh, rest: tuple[float, float, float, float
 def mass_properties(
     weights: Sequence[tuple[trimesh.Trimesh, float]],
 ) -> tuple[float, Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:
-    """Mass (kg), centre of mass (3,) (m) and inertia (3, 3) about it (kg m^2) of bodies of uniform density.
+    """Mass [kg], centre of mass (3,) [m] and inertia (3, 3) about it [kg m^2] of bodies of uniform density.
 
     Args:
-        weights: watertight meshes (m) with their masses (kg).
+        weights: watertight meshes [m] with their masses [kg].
 
     The inertia follows the parallel axis theorem, I = sum I_k + m_k (|r_k|^2 1 - r_k r_k^T).
     """
@@ -207,8 +215,8 @@ def mass_properties(
 def surface_digest(mesh: trimesh.Trimesh, face_labels: Int[np.ndarray, " f"], labels: tuple[str, ...]) -> str:
     """sha256 of a labelled surface: area, centroid and second moments of every region, with the region's name.
 
-    The moments are rounded, and do not depend on how faces are numbered or flat parts are triangulated. So another
-    processor, whose sine differs in the last bit, makes an object of ours with the same digest.
+    The moments are rounded, and do not depend on the order of faces or the triangulation of flat parts. The digest of
+    an object built by code is therefore the same on processors whose sine differs in the last bit.
     """
     digest = hashlib.sha256()
     for index, label in enumerate(labels):
@@ -218,7 +226,10 @@ def surface_digest(mesh: trimesh.Trimesh, face_labels: Int[np.ndarray, " f"], la
 
 
 def _moments(triangles: Float[np.ndarray, "n 3 3"]) -> Int[np.ndarray, " 10"]:
-    """Rounded area, first and second moments of triangles; edge midpoints integrate quadratics exactly."""
+    """Area, centroid and second moments of triangles in units of `DIGEST_LENGTH`, rounded.
+
+    The quadrature at edge midpoints is exact for quadratic functions.
+    """
     area = trimesh.triangles.area(triangles) / 3
     middles = (triangles + np.roll(triangles, 1, axis=1)) / 2
     first = np.einsum("n,nkd->d", area, middles)

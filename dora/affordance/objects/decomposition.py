@@ -1,4 +1,4 @@
-"""Convex decomposition of meshes, kept on disk, and how far it is from the mesh."""
+"""Convex decomposition of meshes by CoACD, cached on disk, and its deviation from the mesh."""
 
 from __future__ import annotations
 
@@ -19,29 +19,31 @@ from dora.errors import InputError
 from dora.files import read_tensors, write_tensors
 
 THRESHOLD = 0.05
-"""Default concavity of a hull; see `decompose`."""
+"""Default largest concavity of a hull relative to the mesh's size; see `decompose` [1]."""
 LARGEST_THRESHOLD = 1.0
+"""Concavity that yields a single hull [1]."""
 ITERATIONS, DEPTH = 60, 2
-"""Effort of CoACD's search for each cut; its own 150 and 3 take twice as long for hulls no nearer to our objects."""
+"""Effort of CoACD's tree search for each cut; its defaults 150 and 3 take twice as long without better hulls."""
 HULL_VERTICES = 200
-"""Most vertices of a hull: PhysX takes 255, and a contact costs more with each."""
+"""Largest number of vertices of a hull: PhysX's limit is 255, and contacts cost more with each."""
 SAMPLES = 20_000
-"""Points of a surface at which the deviation is measured."""
+"""Number of surface points at which the deviation is measured."""
 TOUCHING = 1e-5
-"""Points of one hull nearer to another hull (m) lie on a cut between the two, not on the surface of the union."""
+"""Distance to another hull below which a point lies on a cut between hulls, not on the union's surface [m]."""
 CACHE_VARIABLE = "DORA_CACHE"
+"""Environment variable with the folder of cached files."""
 FORMAT = "dora-hulls 1"
 """Format and version of a file of hulls."""
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """Distance (m) between a mesh and the union of convex hulls that stands for it.
+    """Deviation of a union of convex hulls from the mesh that it approximates.
 
     Attributes:
-        outward: farthest point of the union outside the mesh.
-        inward: deepest point of the mesh's surface that no hull covers.
-        mean: mean over the union's surface of the distance to the mesh.
+        outward: largest distance of the union's surface outside the mesh [m].
+        inward: largest distance of the mesh's surface outside the union [m].
+        mean: mean distance of the union's surface from the mesh [m].
     """
 
     outward: float
@@ -50,22 +52,22 @@ class Deviation:
 
 
 def cache_folder() -> Path:
-    """Where decompositions are kept: $DORA_CACHE, else ~/.cache/dora."""
+    """Folder of cached files: $DORA_CACHE, else ~/.cache/dora."""
     return Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "dora")
 
 
 def decompose(
     mesh: trimesh.Trimesh, threshold: float = THRESHOLD, cache_dir: Path | str | None = None
 ) -> list[trimesh.Trimesh]:
-    """Convex hulls that together stand for a mesh, by CoACD; read from the disk if done before.
+    """Approximate convex decomposition of a mesh by CoACD; read from the cache if computed before.
 
     X. Wei et al., "Approximate Convex Decomposition for 3D Meshes with Collision-Aware Concavity and Tree Search",
     ACM Transactions on Graphics 41(4), 2022. Holes stay open, unlike with a single hull.
 
     Args:
-        mesh: watertight (m).
-        threshold: largest concavity of a hull, as a share of the mesh's size; .01 is fine, 1 is a single hull.
-        cache_dir: where to keep the hulls; `cache_folder()` if None.
+        mesh: watertight mesh [m].
+        threshold: largest concavity of a hull relative to the mesh's size, 0.01 (fine) to 1 (a single hull) [1].
+        cache_dir: folder of the cache; `cache_folder()` if None.
 
     Raises:
         InputError: the threshold is out of range, or the mesh is not watertight.
@@ -84,7 +86,7 @@ def decompose(
 
 
 def deviation(mesh: trimesh.Trimesh, hulls: Sequence[trimesh.Trimesh], seed: int = 0) -> Deviation:
-    """How far the union of hulls is from a mesh, both watertight; measured at random points of both surfaces."""
+    """Deviation of the union of hulls from a watertight mesh, measured at random points of both surfaces."""
     surface = trimesh.sample.sample_surface(mesh, SAMPLES, seed=seed)[0]
     uncovered = np.min([_signed_distance(hull, surface) for hull in hulls], axis=0)
     areas = np.array([hull.area for hull in hulls])
@@ -100,7 +102,7 @@ def deviation(mesh: trimesh.Trimesh, hulls: Sequence[trimesh.Trimesh], seed: int
 def _outside_of_others(
     hulls: Sequence[trimesh.Trimesh], own: int, cloud: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "m 3"]:
-    """The points of one hull's surface that lie in no other hull."""
+    """Those points (m, 3) of one hull's surface that lie in no other hull [m]."""
     for other, hull in enumerate(hulls):
         if other != own and len(cloud):
             cloud = cloud[_signed_distance(hull, cloud) > TOUCHING]
@@ -108,14 +110,14 @@ def _outside_of_others(
 
 
 def _signed_distance(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Distance (m) to a watertight surface, negative inside."""
+    """Signed distance (n,) of points (n, 3) to a watertight surface, negative inside [m]."""
     vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
     signed = igl.signed_distance(np.array(points), vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)
     return np.asarray(signed[0])
 
 
 def _run(mesh: trimesh.Trimesh, threshold: float) -> list[trimesh.Trimesh]:
-    """CoACD, without the voxel preprocessing that would blur a watertight mesh."""
+    """Runs CoACD without its voxel preprocessing, which would blur a watertight mesh."""
     import coacd
 
     coacd.set_log_level("error")
@@ -131,7 +133,7 @@ def _run(mesh: trimesh.Trimesh, threshold: float) -> list[trimesh.Trimesh]:
 
 
 def _digest(mesh: trimesh.Trimesh, threshold: float) -> str:
-    """sha256 of all on which the hulls depend."""
+    """sha256 of everything on which the hulls depend."""
     digest = hashlib.sha256(f"{FORMAT} {threshold} {HULL_VERTICES} {ITERATIONS} {DEPTH}".encode())
     digest.update(np.array(mesh.vertices, np.float64).tobytes())
     digest.update(np.array(mesh.faces, np.int64).tobytes())

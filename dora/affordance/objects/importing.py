@@ -1,4 +1,4 @@
-"""Objects of users: any mesh that trimesh reads, repaired, scaled, labelled and cut into convex pieces."""
+"""Import of users' objects: any mesh that trimesh reads, repaired, scaled, labelled, and decomposed into hulls."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from dora.affordance.objects.surface_repair import repair
 from dora.errors import InputError
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-"""Metres per unit of length."""
+"""Factor from each unit of length to metres [m]."""
 SMALLEST, LARGEST = 0.005, 2.0
-"""Longest side (m) of an object that a hand could meet."""
+"""Range of the longest side of an object, outside of which its unit is most likely wrong [m]."""
 MOST_FACES = 200_000
+"""Largest number of faces of a mesh."""
 DENSITY = 600.0
-"""Density (kg/m^3), of wood, where no mass is given."""
+"""Density where no mass is given, that of wood [kg/m^3]."""
 STABLE = 0.002
-"""An object stands as modelled if its centre of mass is at least this far (m) inside the outline of its foot."""
+"""Smallest distance of the centre of mass from the outline of the foot at which an object stands as modelled [m]."""
 
 
 def import_object(
@@ -39,14 +40,14 @@ def import_object(
     """An object from a file. Axes are kept, the origin moves to the centre of mass.
 
     Args:
-        path: OBJ, STL, PLY, GLB, OFF or another format of trimesh. Several bodies are united.
-        labels: see `dora.affordance.objects.labels.read_labels`; if None, the parts are the named bodies of the file,
-            else its materials, else the whole.
-        scale: factor of all lengths.
-        units: of the file, one of `UNITS`; glTF files are in m.
-        mass: kg; that of wood if None.
-        threshold: of the convex decomposition, see `dora.affordance.objects.decomposition.decompose`.
-        cache_dir: where the decomposition is kept.
+        path: file in OBJ, STL, PLY, GLB, OFF or another format of trimesh. Several bodies are united.
+        labels: file of labels, see `dora.affordance.objects.labels.read_labels`; if None, the regions are the named
+            bodies of the file, else its materials, else the whole mesh.
+        scale: factor of all lengths [1].
+        units: unit of length of the file, one of `UNITS`; glTF files are in metres.
+        mass: mass [kg]; that of wood if None.
+        threshold: concavity of the convex decomposition, see `dora.affordance.objects.decomposition.decompose` [1].
+        cache_dir: folder of cached decompositions; the default one if None.
 
     Raises:
         InputError: the file cannot be read, is empty, not finite, cannot be closed, has too many faces or an absurd
@@ -83,11 +84,11 @@ def import_object(
 
 
 def read_mesh(path: Path, keep_order: bool = False) -> tuple[trimesh.Trimesh, list[str]]:
-    """All triangles of a file in one mesh, and for each the name of its part.
+    """All triangles of a file in one mesh, and the name of the part of each.
 
     Args:
-        path: of the file.
-        keep_order: keep the faces of an OBJ file in their order, and do without the names.
+        path: path of the file.
+        keep_order: keep the faces of an OBJ file in their order, which loses the names.
 
     Raises:
         InputError: it cannot be read, holds no triangles, too many, or coordinates that are not finite.
@@ -114,7 +115,7 @@ def read_mesh(path: Path, keep_order: bool = False) -> tuple[trimesh.Trimesh, li
 
 
 def _load(path: Path, options: dict[str, Any]) -> trimesh.Scene:
-    """What trimesh reads; `options` are for OBJ files alone."""
+    """The scene that trimesh reads from a file; `options` apply to OBJ files alone."""
     own = options if path.suffix.lower() == ".obj" else {}
     try:
         return trimesh.load_scene(path, process=False, **own)
@@ -124,7 +125,7 @@ def _load(path: Path, options: dict[str, Any]) -> trimesh.Scene:
 
 
 def _parts(scene: trimesh.Scene) -> list[tuple[str, trimesh.Trimesh]]:
-    """Triangle meshes of a scene in its frame with their names: of bodies if these differ, else of materials."""
+    """Triangle meshes of a scene in its frame, named by body if these names differ, else by material."""
     placed, order = [], {name: i for i, name in enumerate(scene.geometry)}
     for node in sorted(scene.graph.nodes_geometry, key=lambda node: (order[scene.graph[node][1]], node)):
         pose, name = scene.graph[node]
@@ -147,7 +148,7 @@ def _without_number(name: str) -> str:
 
 
 def _check_size(mesh: trimesh.Trimesh, path: Path, factor: float) -> None:
-    """Refuse what cannot be held, most often because of the wrong unit."""
+    """Refuses meshes outside of `SMALLEST` to `LARGEST`, which most often have the wrong unit."""
     longest = float(mesh.extents.max()) * factor
     if not SMALLEST <= longest <= LARGEST:
         raise InputError(
@@ -157,7 +158,7 @@ def _check_size(mesh: trimesh.Trimesh, path: Path, factor: float) -> None:
 
 
 def _label_of(hull: trimesh.Trimesh, mesh: trimesh.Trimesh, index: np.ndarray) -> int:
-    """The label with the most surface in or near a hull."""
+    """Index of the label with the largest area in or near a hull."""
     planes, offsets = hull.face_normals, np.einsum("nd,nd->n", hull.face_normals, hull.triangles[:, 0])
     apart = (mesh.triangles_center @ planes.T - offsets).max(1)
     near = apart <= max(0.02 * hull.scale, apart.min())
@@ -165,7 +166,7 @@ def _label_of(hull: trimesh.Trimesh, mesh: trimesh.Trimesh, index: np.ndarray) -
 
 
 def resting_pose(mesh: trimesh.Trimesh) -> tuple[float, float, float, float]:
-    """Orientation (wxyz) in which an object rests on a table: as modelled if that is stable, else the likeliest."""
+    """Orientation at rest on a table, wxyz: as modelled if that is stable, else the most probable stable pose."""
     if _stands(mesh):
         return UPRIGHT
     with np.errstate(invalid="ignore"):
@@ -175,7 +176,7 @@ def resting_pose(mesh: trimesh.Trimesh) -> tuple[float, float, float, float]:
 
 
 def _stands(mesh: trimesh.Trimesh) -> bool:
-    """Whether the centre of mass is above the lowest points, and not at their edge."""
+    """Whether the centre of mass is above the convex hull of the lowest points, by at least `STABLE`."""
     z = mesh.vertices[:, 2]
     foot: Float[np.ndarray, "n 2"] = mesh.vertices[z < z.min() + STABLE / 4][:, :2] - mesh.center_mass[:2]
     around = np.arange(0, 2 * np.pi, 0.1)

@@ -1,4 +1,4 @@
-"""Names of the parts of a user's mesh: from a file with one label per face, from regions in space, or from the mesh."""
+"""Labels of the faces of a user's mesh: from a file with one per face, from regions in space, or from part names."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from jaxtyping import Bool, Float, Int
 from dora.errors import InputError
 
 WHOLE = "body"
-"""Label of a mesh without parts, and of what no region covers."""
+"""Label of a mesh without parts, and of faces in no region."""
 WANTED = "handle"
-"""Label that is the target if a mesh has it and nothing else is asked for."""
+"""Label that is the default target if a mesh has it."""
 
 
 @dataclass(frozen=True, eq=False)
 class FaceLabels:
-    """Labels of F faces.
+    """Labels of f faces.
 
     Attributes:
-        names: of the regions, each with at least one face.
+        names: names of the regions, each with at least one face.
         index: (f,) index into `names`.
-        target: name of the region that a task wants held.
+        target: name of the region that a task wants inside.
     """
 
     names: tuple[str, ...]
@@ -37,10 +37,15 @@ class FaceLabels:
 
     @classmethod
     def from_names(cls, names: Sequence[str], target: str | None = None, source: str = "the mesh") -> FaceLabels:
-        """From one name per face.
+        """Labels from one name per face.
+
+        Args:
+            names: name of every face.
+            target: name of the target; `WANTED` if a face has it, else the first name, if None.
+            source: what the message of an error calls the source of the target.
 
         Raises:
-            InputError: the target is none of them.
+            InputError: the target is none of the names.
         """
         distinct = tuple(dict.fromkeys(names))
         if target is None:
@@ -63,7 +68,7 @@ def read_labels(path: Path, centers: Float[np.ndarray, "f 3"]) -> FaceLabels:
     Args:
         path: .txt with one name or number per line, .npy with one number or name per face, .json with a list of
             them or {"labels": [names], "faces": [numbers], "target": name}, or .yaml with regions (docs/objects.md).
-        centers: (f, 3) centres of the faces in the coordinates of the mesh file.
+        centers: (f, 3) centres of the faces in the coordinates of the mesh file, in its unit of length.
 
     Raises:
         InputError: no such file, another kind of file, another number of labels, or a name that does not exist.
@@ -107,7 +112,7 @@ def _from_json(path: Path, centers: np.ndarray) -> FaceLabels:
 def _per_face(
     path: Path, entries: Sequence[Any], centers: np.ndarray, names: Sequence[str] = (), target: str | None = None
 ) -> FaceLabels:
-    """From one entry per face: a name, or a number that counts `names` or, without them, names itself."""
+    """Labels from one entry per face: a name, an index into `names`, or without `names` any number."""
     texts = [str(entry).strip() for entry in entries]
     while texts and not texts[-1]:
         texts.pop()
@@ -125,7 +130,7 @@ def _per_face(
 
 
 def _from_yaml(path: Path, centers: np.ndarray) -> FaceLabels:
-    """From regions in space; a face belongs to the first that holds its centre."""
+    """Labels from regions in space; a face belongs to the first region that contains its centre."""
     content = yaml.safe_load(path.read_text())
     known = {"regions", "rest", "target"}
     if not isinstance(content, dict) or not isinstance(content.get("regions"), dict) or not content.keys() <= known:
@@ -133,23 +138,23 @@ def _from_yaml(path: Path, centers: np.ndarray) -> FaceLabels:
     names = np.full(len(centers), str(content.get("rest", WHOLE)), dtype=object)
     free = np.ones(len(centers), bool)
     for name, shape in content["regions"].items():
-        held = _inside(path, str(name), shape, centers)
-        if not held.any():
+        inside = _inside(path, str(name), shape, centers)
+        if not inside.any():
             raise InputError(
                 f"region {name!r} of {path} holds no face; the mesh reaches from {centers.min(0).round(4).tolist()} "
                 f"to {centers.max(0).round(4).tolist()} in the coordinates of its file."
             )
-        names[held & free] = str(name)
-        free &= ~held
+        names[inside & free] = str(name)
+        free &= ~inside
     return FaceLabels.from_names(names.tolist(), content.get("target"), str(path))
 
 
 SHAPES = {"box": ("min", "max"), "plane": ("point", "normal")}
-"""Kinds of regions and their two vectors: a box between corners, or the side of a plane to which its normal points."""
+"""Kinds of regions and their two vectors: a box between corners, or the half space to which a plane's normal points."""
 
 
 def _inside(path: Path, name: str, shape: Any, centers: Float[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
-    """Which centres lie in a region, or in one of a list of regions."""
+    """Mask of the centres that lie in a region, or in any of a list of regions."""
     if isinstance(shape, list) and shape:
         return np.logical_or.reduce([_inside(path, name, each, centers) for each in shape])
     for kind, keys in SHAPES.items():

@@ -1,8 +1,8 @@
-"""Signed distance to an object: exact by libigl, and on a grid with trilinear interpolation for the optimiser.
+"""Signed distance to an object: exact by libigl, and on a grid with trilinear interpolation for the search.
 
-Distances are positive outside. The grid is filled exactly near the surface and, farther away, by
-interpolation of a grid that is `COARSENING` times coarser: filling is several times faster so, and the
-interpolant's error stays well below a millimetre (`SignedDistanceField.error` measures it).
+Distances are positive outside. Nodes near the surface have exact values; the others are interpolated from a grid that
+is `COARSENING` times coarser, which makes filling several times faster. The error of the interpolation stays well
+below a millimetre (`SignedDistanceField.error` measures it).
 """
 
 from __future__ import annotations
@@ -23,25 +23,26 @@ os.environ.setdefault("IGL_NUM_THREADS", "1")  # read once, when libigl is first
 import igl
 
 SPACING = 2.5e-3
-"""Grid spacing (m)."""
+"""Distance of neighbouring nodes of the grid [m]."""
 MARGIN = 0.05
-"""Width (m) of the grid around the object's bounding box; more than the radius of any hand capsule."""
+"""Margin of the grid around the object's bounding box; more than the radius of any capsule of a hand [m]."""
 COARSENING = 4
-"""Ratio of the coarse and the fine spacing."""
+"""Ratio of the coarse to the fine spacing [1]."""
 BAND = 0.01
-"""Nodes within this distance (m) of the surface are exact."""
+"""Distance from the surface up to which nodes have exact values [m]."""
 MAX_NODES = 1.6e7
-"""Largest grid, whose nodes float32 can still count; a larger object is absurdly large for a hand."""
+"""Largest number of nodes, the range in which float32 represents all integers."""
 CHANNELS = 4
-"""Columns of a field's table without the region: distance (m) and unit gradient (3,)."""
+"""Columns of a field's table without the region: distance [m] and unit gradient (3,)."""
 _TINY = 1e-12
+"""Lower bound of a length by which a vector is divided [m]."""
 CULL = 1.25
-"""|interpolated value - value at the nearest node| is at most this times the spacing, gradients being unit."""
+"""Bound on |interpolated distance - distance at the nearest node| in spacings, for unit gradients [1]."""
 
 
 @dataclass(frozen=True)
 class FieldError:
-    """Error (m) of a field against the mesh at points within `reach` (m) of its surface."""
+    """Mean and largest error [m] of a field against the mesh at points within `reach` [m] of its surface."""
 
     mean: float
     largest: float
@@ -49,18 +50,18 @@ class FieldError:
 
 
 class ExactDistance:
-    """Exact signed distance to a watertight mesh (m) by libigl, on one thread."""
+    """Exact signed distance to a watertight mesh [m] by libigl, on one thread."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self._vertices = np.array(mesh.vertices, dtype=np.float64)
         self._faces = np.array(mesh.faces, dtype=np.int64)
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Signed distance (m) of points in the mesh's frame."""
+        """Signed distance (n,) of points (n, 3) in the mesh's frame, negative inside [m]."""
         return self.with_gradient(points)[:, 0]
 
     def with_gradient(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
-        """Signed distance and its unit gradient; on the surface the gradient is the mesh's normal."""
+        """(n, 4) signed distance [m] and its unit gradient; on the surface the gradient is the mesh's normal."""
         if not len(points):
             return np.zeros((0, CHANNELS))
         points = np.ascontiguousarray(points, dtype=np.float64)
@@ -72,7 +73,7 @@ class ExactDistance:
         return np.column_stack((distance, gradient))
 
     def unsigned(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Distance (m) to the surface, which need not be closed."""
+        """Unsigned distance (n,) of points (n, 3) to the surface, which may be open [m]."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         return np.sqrt(igl.point_mesh_squared_distance(points, self._vertices, self._faces)[0])
 
@@ -81,16 +82,16 @@ class SignedDistanceField:
     """Signed distance, its gradient and optionally the distance to a region on a regular grid.
 
     Args:
-        solid: watertight mesh (m) with outward faces.
-        region: open surface (m), part of the object, to which the last channel is the unsigned distance.
+        solid: watertight mesh with outward faces [m].
+        region: open surface whose unsigned distance is the last channel [m]; no such channel if None.
         dtype: floating type of every tensor.
         device: torch device of every tensor.
-        spacing: grid spacing (m).
+        spacing: distance of neighbouring nodes [m].
 
     Attributes:
         exact: the exact distance to `solid`.
-        table: (nodes, 4 or 5) distance, unit gradient, distance to the region; the last axis runs fastest.
-        shape: nodes along x, y, z; `lower`, `upper` (3,) are the positions of the first and the last (m).
+        table: (nodes, 4 or 5) distance [m], unit gradient, distance to the region [m]; z varies fastest.
+        shape: number of nodes along x, y, z; `lower`, `upper` (3,) are the positions of the first and the last [m].
 
     Raises:
         InputError: the object is too large for a grid of this spacing.
@@ -129,24 +130,28 @@ class SignedDistanceField:
         self.lower, self.upper = self.table.new_tensor(lower), self.table.new_tensor(lower + (fine - 1) * spacing)
 
     def may_touch(self, points: Float[Tensor, "c p 3"], reach: Float[Tensor, " p"]) -> Int[Tensor, " n"]:
-        """Flat indices into (c, p) of all points whose interpolated distance may be below `reach` (p,) (m).
+        """Flat indices into (c, p) of all points whose interpolated distance may be below `reach` (p,) [m].
 
-        A point that is left out is farther away. Costs one look-up of the nearest node.
+        Conservative: a point that is left out is farther away. Costs one look-up of the nearest node.
         """
         node = torch.clamp(self._place(points).round_(), self._zero, self._last) @ self._strides
         near = self._distance.index_select(0, node.int().flatten()).view(node.shape)
         return (near < reach + CULL * self.spacing).flatten().nonzero().squeeze(1)
 
     def _place(self, points: Tensor) -> Tensor:
-        """Positions in units of the spacing, from the first node."""
+        """Positions relative to the first node, in spacings."""
         return torch.addcmul(self._origin, points, self._scale)
 
     def sample(
         self, points: Float[Tensor, "n 3"], channels: int | None = None
     ) -> tuple[Float[Tensor, "n k"], Float[Tensor, "n k 3"]]:
-        """Interpolated channels of the table, and the exact derivatives of the interpolant (per m).
+        """Interpolated channels of the table at points in the object frame [m], and their exact derivatives [1/m].
 
-        Outside the grid the distances grow by the distance to the grid, and gradients stay constant.
+        Outside the grid the distance to the grid is added to the distances, and gradients are constant.
+
+        Args:
+            points: (n, 3) positions [m].
+            channels: number of channels, from the first; all if None.
         """
         place = self._place(points)
         inside = torch.clamp(place, self._zero, self._last)
@@ -168,11 +173,11 @@ class SignedDistanceField:
         return value, jacobian
 
     def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Interpolated signed distance (m)."""
+        """Interpolated signed distance of points in the object frame [m]."""
         return self.sample(points.reshape(-1, 3), 1)[0].reshape(points.shape[:-1])
 
     def error(self, count: int = 20_000, reach: float = BAND, seed: int = 0) -> FieldError:
-        """Compare with the exact distance at random points near the surface."""
+        """Error against the exact distance at `count` random points within `reach` [m] of the surface."""
         generator = np.random.default_rng(seed)
         points = trimesh.sample.sample_surface(self.solid, count, seed=seed)[0]
         points = points + generator.uniform(-reach, reach, points.shape) / np.sqrt(3)
@@ -188,20 +193,20 @@ def _mix(corner: Tensor, share: Tensor) -> Tensor:
 
 
 def _blend(corner: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-    """Slope and interpolation between the first and the second half of corners."""
+    """Difference of, and interpolation between, the first and the second half of corners."""
     low, high = corner.chunk(2)
     slope = high - low
     return slope, torch.addcmul(low, slope, share)
 
 
 def _nodes(lower: np.ndarray, spacing: float, shape: Sequence[int] | np.ndarray) -> np.ndarray:
-    """Positions (nodes, 3) of a grid's nodes, the last axis running fastest."""
+    """Positions (nodes, 3) of a grid's nodes [m]; z varies fastest."""
     axes = [start + spacing * np.arange(count) for start, count in zip(lower, shape, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
 def _refined(values: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Trilinear interpolation of values (nodes, k) on a grid to one `COARSENING` times finer."""
+    """Trilinear interpolation of values (nodes, k) from a grid to one that is `COARSENING` times finer."""
     volume = torch.as_tensor(values.T.reshape(1, -1, *shape))
     size = [int(count - 1) * COARSENING + 1 for count in shape]
     fine = torch.nn.functional.interpolate(volume, size=size, mode="trilinear", align_corners=True)
@@ -209,7 +214,7 @@ def _refined(values: np.ndarray, shape: np.ndarray) -> np.ndarray:
 
 
 def _fill(exact: ExactDistance, lower: np.ndarray, spacing: float, coarse: np.ndarray, fine: np.ndarray) -> np.ndarray:
-    """Distance and gradient (nodes, 4) on the fine grid."""
+    """Distance [m] and unit gradient (nodes, 4) on the fine grid."""
     values = _refined(exact.with_gradient(_nodes(lower, COARSENING * spacing, coarse)), coarse).copy()
     near = np.abs(values[:, 0]) < BAND
     values[near] = exact.with_gradient(_nodes(lower, spacing, fine)[near])

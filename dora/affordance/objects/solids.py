@@ -1,4 +1,4 @@
-"""Solids by turning, sweeping and lofting, and their union with the origin of every face. All lengths in m."""
+"""Solids by revolution, sweep and loft, and their union, which keeps the origin of every face; lengths in [m]."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from dora.geometry.rotations import quaternion_from_matrix
 from dora.robot.shapes import Shape
 
 AROUND = 24
-"""Divisions around a cylinder or capsule as a mesh."""
+"""Number of divisions around a cylinder or capsule as a mesh."""
 FIT_STEPS = 20
-"""Steps of the fit; after them corners still slide along the path, but the polyline comes no nearer to it."""
+"""Number of steps of the fit; more of them move corners along the path without reducing the distance."""
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
-"""Turn (rad) between directions of a spiral that spreads evenly over a sphere."""
+"""Angle between successive directions of a spiral that spreads evenly over a sphere [rad]."""
 
 
 def lathe(profile: Float[np.ndarray, "n 2"], sections: int) -> trimesh.Trimesh:
-    """The solid that (radius, height) points, from axis to axis, make when turned about z."""
+    """Solid of revolution about z of a profile of (radius, height) points that begins and ends on the axis [m]."""
     return outward(trimesh.creation.revolve(profile, sections=sections))
 
 
 def loft(rings: Float[np.ndarray, "m n 3"]) -> trimesh.Trimesh:
-    """The solid through m closed rings of n points each, with flat ends."""
+    """Solid through m closed rings of n points each, with flat ends [m]."""
     m, n, _ = rings.shape
     here, there = np.arange(n), np.roll(np.arange(n), -1)
     start = n * np.arange(m - 1)[:, None]
@@ -48,7 +48,7 @@ def loft(rings: Float[np.ndarray, "m n 3"]) -> trimesh.Trimesh:
 
 
 def sweep(path: Float[np.ndarray, "m 3"], outline: Float[np.ndarray, "m n 2"]) -> trimesh.Trimesh:
-    """Outlines along a path in a plane of constant y: (u, v) of an outline lie along the path's normal and along y."""
+    """Solid of outlines along a path in a plane of constant y; (u, v) are along the path's normal and along y [m]."""
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     across = np.array([0.0, 1.0, 0.0])
@@ -59,7 +59,7 @@ def sweep(path: Float[np.ndarray, "m 3"], outline: Float[np.ndarray, "m n 2"]) -
 def ellipses(
     half_u: Float[np.ndarray, " m"], half_v: Float[np.ndarray, " m"], points: int, power: float = 2.0
 ) -> Float[np.ndarray, "m n 2"]:
-    """Outlines |u / half_u|^power + |v / half_v|^power = 1; 2 is an ellipse, more is a rounded rectangle."""
+    """Superellipses |u / half_u|^power + |v / half_v|^power = 1 [m]; power 2 gives an ellipse."""
     angle = np.linspace(0, 2 * np.pi, points, endpoint=False)
     unit = np.stack([np.cos(angle), np.sin(angle)], -1)
     unit = np.sign(unit) * np.abs(unit) ** (2 / power)
@@ -67,20 +67,20 @@ def ellipses(
 
 
 def spline(knots: Float[np.ndarray, "k d"], points: int) -> Float[np.ndarray, "m d"]:
-    """A smooth curve through knots, at even parameters; the parameter grows with the distance of the knots."""
+    """Points at equal parameters of a cubic spline through knots, parametrised by chord length."""
     length = np.linalg.norm(np.diff(knots, axis=0), axis=1)
     parameter = np.concatenate([[0.0], np.cumsum(length)])
     return CubicSpline(parameter, knots)(np.linspace(0, parameter[-1], points))
 
 
 def arc(center: tuple[float, float], radius: float, start: float, end: float, points: int) -> Float[np.ndarray, "m 2"]:
-    """Points of a circle from one angle (deg) to another."""
+    """Points of a circle [m] from one angle [deg] to another."""
     angle = np.radians(np.linspace(start, end, points))
     return np.stack([center[0] + radius * np.cos(angle), center[1] + radius * np.sin(angle)], -1)
 
 
 def chamfered_box(size: Sequence[float], chamfer: float, subdivisions: int = 0) -> trimesh.Trimesh:
-    """A box of (x, y, z) size with flattened edges, centred at the origin."""
+    """A box with chamfered edges, centred at the origin; `size` along x, y, z and `chamfer` in [m]."""
     half, corners = np.asarray(size) / 2, trimesh.creation.box().vertices * 2
     points = np.concatenate([corners * (half - chamfer * (1 - np.eye(3)[axis])) for axis in range(3)])
     mesh = trimesh.convex.convex_hull(points)
@@ -90,7 +90,7 @@ def chamfered_box(size: Sequence[float], chamfer: float, subdivisions: int = 0) 
 
 
 def capsule_between(start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"], radius: float) -> Shape:
-    """The capsule with the centres of its caps at two points."""
+    """The capsule of a radius [m] with the centres of its caps at two points (3,) [m]."""
     axis = end - start
     length = float(np.linalg.norm(axis))
     axis = axis / length
@@ -104,7 +104,7 @@ def capsule_between(start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"]
 
 
 def shape_mesh(shape: Shape) -> trimesh.Trimesh:
-    """A collision primitive as a watertight mesh, in the frame in which the primitive is placed (m)."""
+    """A collision primitive as a watertight mesh, in the frame of the primitive's pose [m]."""
     if shape.kind == "box":
         mesh = trimesh.creation.box(extents=[2 * half for half in shape.size])
     elif shape.kind == "sphere":
@@ -123,7 +123,7 @@ def shape_mesh(shape: Shape) -> trimesh.Trimesh:
 
 
 def simplified(path: Float[np.ndarray, "m d"], tolerance: float) -> Float[np.ndarray, "k d"]:
-    """The fewest points of a path whose polyline stays within `tolerance` of it (Ramer, Douglas and Peucker)."""
+    """Points of a path whose polyline stays within `tolerance` of it, by the Ramer-Douglas-Peucker algorithm."""
     start, end = path[0], path[-1]
     chord = end - start
     along = np.clip((path - start) @ chord / (chord @ chord), 0, 1)
@@ -135,7 +135,7 @@ def simplified(path: Float[np.ndarray, "m d"], tolerance: float) -> Float[np.nda
 
 
 def fitted(path: Float[np.ndarray, "m d"], corners: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k d"]:
-    """Corners moved, all but the first and last, so that their polyline is nearest to a path in the mean square."""
+    """Corners of the polyline with the least-squares distance to a path; the first and the last stay."""
 
     def polyline(inner: np.ndarray) -> np.ndarray:
         return np.concatenate([corners[:1], inner.reshape(-1, corners.shape[1]), corners[-1:]])
@@ -150,7 +150,7 @@ def fitted(path: Float[np.ndarray, "m d"], corners: Float[np.ndarray, "k d"]) ->
 
 
 def hull_of(points: Float[np.ndarray, "n 3"], vertices: int) -> trimesh.Trimesh:
-    """Convex hull of points, with the farthest vertices in evenly spread directions if it would have more."""
+    """Convex hull of points (n, 3) with at most `vertices` vertices, the extreme ones in evenly spread directions."""
     hull = trimesh.convex.convex_hull(points)
     if len(hull.vertices) <= vertices:
         return hull
@@ -165,7 +165,7 @@ def hull_of(points: Float[np.ndarray, "n 3"], vertices: int) -> trimesh.Trimesh:
 def unite(
     parts: Sequence[trimesh.Trimesh],
 ) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"], Int[np.ndarray, " f"]]:
-    """The union of watertight parts; for each of its faces the part that it comes from, and the face of that part.
+    """The union of watertight parts, and for each of its faces the index of its part and of the face in that part.
 
     Raises:
         ValueError: a part is not closed.
@@ -179,19 +179,19 @@ def unite(
 
 
 def subtract(body: trimesh.Trimesh, tool: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The body without what lies inside the tool; both watertight."""
+    """The difference of two watertight meshes: the body without the inside of the tool."""
     return _trimesh((_manifold(body) - _manifold(tool)).to_mesh64())
 
 
 def outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh with its faces turned outwards."""
+    """The mesh with its faces oriented outwards; changed in place."""
     if mesh.volume < 0:
         mesh.invert()
     return mesh
 
 
 def _manifold(mesh: trimesh.Trimesh, identity: int = 0) -> manifold3d.Manifold:
-    """A mesh in the library of booleans; what is left of its faces is found by the identity and their numbers."""
+    """A mesh for manifold3d, whose results refer to its faces by `identity` and face index."""
     raw = manifold3d.Mesh64(
         np.array(mesh.vertices, np.float64, order="C"),
         np.array(mesh.faces, np.uint64, order="C"),
@@ -206,5 +206,5 @@ def _manifold(mesh: trimesh.Trimesh, identity: int = 0) -> manifold3d.Manifold:
 
 
 def _trimesh(raw: manifold3d.Mesh64) -> trimesh.Trimesh:
-    """A result of the library of booleans as a mesh."""
+    """A result of manifold3d as a mesh."""
     return trimesh.Trimesh(raw.vert_properties[:, :3], raw.tri_verts.astype(np.int64), process=False)

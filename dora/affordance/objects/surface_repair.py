@@ -1,4 +1,4 @@
-"""Making a labelled triangle soup watertight, or saying why that cannot be done. Lengths as in the input."""
+"""Repair of labelled triangle meshes into watertight ones, or the reason why that is impossible; lengths as given."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from dora.affordance.objects.solids import unite
 from dora.errors import InputError
 
 MERGE_SHARE = 1e-6
-"""Vertices nearer than this share of the mesh's diagonal are one."""
+"""Distance in diagonals of the mesh below which vertices are merged [1]."""
 MOST_FILLED = 0.3
-"""Largest share of the area that filled holes may add."""
+"""Largest ratio of the area of filled holes to that of the mesh [1]."""
 DEBRIS = 0.01
-"""Connected faces that cannot be closed are dropped if their share of the area is at most this."""
+"""Share of the area up to which a component that cannot be closed is dropped [1]."""
 LEAST_VOLUME = 1e-4
-"""Smallest volume as a share of area^1.5; a ball has .094, a sheet 0."""
+"""Smallest ratio of volume to area^1.5 [1]; a ball has 0.094, a sheet 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class Repaired:
-    """A watertight mesh, the label of each face, and what was done to it, in words."""
+    """A watertight mesh, the label (f,) of each face, and descriptions of what was done to it."""
 
     mesh: trimesh.Trimesh
     labels: Int[np.ndarray, " f"]
@@ -34,12 +34,12 @@ class Repaired:
 def repair(mesh: trimesh.Trimesh, labels: Int[np.ndarray, " f"], name: str) -> Repaired:
     """Merge vertices, drop degenerate and double faces and debris, fill holes, turn faces outwards, unite bodies.
 
-    A body inside another is taken for a part of it, not for a cavity.
+    A body inside another counts as solid, not as a cavity.
 
     Args:
         mesh: any triangles.
-        labels: (f,) of its faces; the faces that fill a hole take the label of a neighbour.
-        name: of the mesh, for the message.
+        labels: (f,) labels of its faces; faces that fill a hole take the label of a neighbour.
+        name: name of the mesh in error messages.
 
     Raises:
         InputError: the surface cannot be closed, would be closed by too much new surface, or holds no volume.
@@ -76,7 +76,7 @@ def repair(mesh: trimesh.Trimesh, labels: Int[np.ndarray, " f"], name: str) -> R
 
 @dataclass(frozen=True, eq=False)
 class _Body:
-    """A watertight body with outward faces, their labels, and what it took."""
+    """A watertight body with outward faces, their labels, the holes filled, and whether its faces were turned."""
 
     mesh: trimesh.Trimesh
     labels: Int[np.ndarray, " f"]
@@ -85,7 +85,7 @@ class _Body:
 
 
 def _closed(body: trimesh.Trimesh, labels: np.ndarray, total_area: float, name: str) -> _Body:
-    """One connected body, closed and turned outwards; raises InputError if that is impossible."""
+    """One connected body, closed and oriented outwards; InputError if that is impossible."""
     area, holes = body.area, 0
     if not body.is_watertight:
         body, labels, holes = _fill(body, labels)
@@ -107,10 +107,10 @@ def _closed(body: trimesh.Trimesh, labels: np.ndarray, total_area: float, name: 
 
 
 def _clean(mesh: trimesh.Trimesh, labels: np.ndarray) -> tuple[trimesh.Trimesh, np.ndarray, int]:
-    """Close vertices merged, degenerate and repeated faces dropped; and how many those are.
+    """The mesh with near vertices merged and degenerate and repeated faces dropped, and the number of those.
 
-    Faces that differ in their sense stay: there two bodies touch. A mesh that is closed already stays as it is,
-    since merging would tie touching bodies together.
+    Equal faces of opposite orientation stay: there two bodies touch. A closed mesh stays as it is, because merging
+    would join touching bodies.
     """
     if mesh.is_watertight:
         return mesh, labels, 0
@@ -127,7 +127,7 @@ def _clean(mesh: trimesh.Trimesh, labels: np.ndarray) -> tuple[trimesh.Trimesh, 
 
 
 def _fill(mesh: trimesh.Trimesh, labels: np.ndarray) -> tuple[trimesh.Trimesh, np.ndarray, int]:
-    """Every hole with a simple rim closed by a fan from the rim's middle."""
+    """The mesh with every hole of simple rim closed by a fan around the rim's centre, and the number of holes."""
     mesh = mesh.copy()
     trimesh.repair.fix_winding(mesh)
     edges = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]

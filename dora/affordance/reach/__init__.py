@@ -1,1 +1,1 @@
-"""Motion feasibility: which candidates the arm can carry out, and from which side."""
+"""Motion feasibility: which candidates the arm can reach, and along which approach."""

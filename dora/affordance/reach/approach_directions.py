@@ -1,4 +1,4 @@
-"""From which side the opened hand gets to a grasp: the direction nearest to the palm's that is free."""
+"""Approach directions on which the opened hand does not hit the object, as near as possible to the candidate's own."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from dora.geometry.rotations import quaternion_apply, quaternion_inverse
 
 
 def free_approaches(candidates: GraspCandidates, reach: Reach) -> tuple[GraspCandidates, Bool[Tensor, " c"]]:
-    """Turn the approach of candidates whose opened hand would run into the object.
+    """Change the approach of candidates whose opened hand would hit the object.
 
-    Tried are the 26 directions from the middle of a cube of 3 x 3 x 3 cells to the others, along the axes of the
-    wrist, those first that are nearest to the candidate's own approach; none that points backwards.
+    The 26 directions to the neighbours in a 3 x 3 x 3 grid along the axes of the wrist are tried, in ascending order
+    of their angle to the candidate's own approach, up to a right angle.
 
     Args:
-        candidates: c of them.
-        reach: of the same robot and object; judges by `hits_object`.
+        candidates: c candidates.
+        reach: filter of the same robot and object, whose `hits_object` decides.
 
     Returns:
-        The candidates with other approaches, and which are free (c,); those that are not keep their own.
+        The candidates with new approaches, and a mask (c,) of those with a free one; the others keep their own.
 
     Raises:
         InputError: Pinocchio or Coal is not installed.
@@ -35,11 +35,11 @@ def free_approaches(candidates: GraspCandidates, reach: Reach) -> tuple[GraspCan
     own = quaternion_apply(quaternion_inverse(candidates.quaternion), candidates.approach)
     likeness, order = (own @ directions.T).sort(dim=1, descending=True)
     approach, free = candidates.approach.clone(), ~reach.hits_object(candidates)
-    for rank in range(len(directions)):
-        rows = (~free & (likeness[:, rank] > 0)).nonzero().squeeze(1)
+    for column in range(len(directions)):
+        rows = (~free & (likeness[:, column] > 0)).nonzero().squeeze(1)
         if len(rows) == 0:
             break
-        turned = quaternion_apply(candidates.quaternion[rows], directions[order[rows, rank]])
+        turned = quaternion_apply(candidates.quaternion[rows], directions[order[rows, column]])
         clear = ~reach.hits_object(replace(candidates.select(rows), approach=turned))
         approach[rows[clear]] = turned[clear]
         free[rows[clear]] = True

@@ -1,4 +1,4 @@
-"""Paths of the arm to candidates: along the approach, and what leads to its beginning."""
+"""Paths of the arm to candidates: a transit from the start posture to the standoff, then the approach."""
 
 from __future__ import annotations
 
@@ -24,31 +24,33 @@ REASONS = (
     "arm collision",
     "no motion from the start",
 )
-"""Why a candidate is rejected; `Reachability.reason` holds indices. The order is that of the tests."""
+"""Reasons for which a candidate is rejected, in the order of the tests; `Reachability.reason` has indices into it."""
 OK, HAND_TABLE, HAND_OBJECT, OUT_OF_REACH, NOT_CONTINUOUS, ARM_COLLISION, NO_MOTION = range(len(REASONS))
+"""Indices into `REASONS`."""
 
 
 @dataclass(frozen=True)
 class ReachSettings:
-    """Numbers of the filter.
+    """Numbers of the motion-feasibility filter.
 
     Attributes:
-        motion: from the start posture to the standoff: "servo" rolls out the tasks' wrist controller; "plan" tries a
-            straight line in joint space and then a planner; "none" asks only for the approach itself.
+        motion: the transit from the start posture to the standoff: "controller" rolls out the tasks' wrist controller;
+            "plan" tries a straight line in joint space and then a planner; "none" requires no transit.
         standoff: length of the approach [m].
-        spacing: distance of the postures that are checked along it [m].
-        table_height: of the table's upper face in the world [m].
-        table_clearance: smallest height of hand and arm above it [m].
-        overlap: how deep the opened hand may be in the object on the approach [m]; candidates touch it on purpose.
-        clearance: smallest distance from the object before the approach [m].
-        speed: of the wrist on the approach [m/s]; with it no joint may exceed its velocity limit.
-        seeds: starts of the inverse kinematics per candidate.
-        stride: control steps between two postures that are checked with motion "servo".
+        spacing: distance of the postures that are checked along the approach [m].
+        table_height: height of the table's upper face in the world [m].
+        table_clearance: smallest height of hand and arm above the table [m].
+        overlap: largest penetration depth of the opened hand in the object on the approach [m]; at the end of the
+            approach the hand is meant to touch it.
+        clearance: smallest distance from the object in the transit [m].
+        speed: speed of the wrist on the approach [m/s], at which no joint may exceed its velocity limit.
+        seeds: number of seeds of the inverse kinematics per candidate.
+        stride: control steps between two postures that are checked with motion "controller".
         plan: effort of the planner.
-        controller: numbers of the wrist controller that motion "servo" rolls out.
+        controller: numbers of the wrist controller that motion "controller" rolls out.
     """
 
-    motion: Literal["servo", "plan", "none"] = "servo"
+    motion: Literal["controller", "plan", "none"] = "controller"
     standoff: float = 0.1
     spacing: float = 0.02
     table_height: float = 0.0
@@ -64,7 +66,7 @@ class ReachSettings:
 
 @dataclass(frozen=True, eq=False)
 class Goals:
-    """n wrist poses (m, wxyz) in the base frame, each with the unit direction of its approach."""
+    """n wrist poses ([m], wxyz) in the robot's base frame, each with the unit direction of its approach."""
 
     position: Float[Tensor, "n 3"]
     quaternion: Float[Tensor, "n 4"]
@@ -76,12 +78,12 @@ class Goals:
 
 @dataclass(frozen=True, eq=False)
 class ApproachPaths:
-    """One way per goal.
+    """One path per goal.
 
     Attributes:
-        descent: (n, k, dof) arm joints [rad] from the standoff to the candidate.
-        transit: n times the postures (t, dof) before it [rad], or None where they are not known.
-        failure: (n,) index into `REASONS` of what is wrong without looking for collisions.
+        descent: (n, k, dof) arm joints on the approach, from the standoff to the candidate [rad].
+        transit: n arrays (t, dof) of arm joints from the start posture to the standoff [rad]; None where not known.
+        failure: (n,) index into `REASONS`, before collisions are tested.
     """
 
     descent: Float[Tensor, "n k dof"]
@@ -92,22 +94,31 @@ class ApproachPaths:
 def attempts(
     kinematics: InverseKinematics, goals: Goals, start: Float[Tensor, " dof"], settings: ReachSettings
 ) -> Iterator[Callable[[Int[Tensor, " m"]], ApproachPaths]]:
-    """Functions from rows of `goals` to ways, best way first; ask the next one for the rows the last one failed."""
-    if settings.motion == "servo":
-        yield lambda rows: _servo(kinematics, goals[rows], start, settings)
+    """Functions from rows of `goals` to paths, the best paths first; call the next one for rows that failed.
+
+    Args:
+        kinematics: inverse kinematics of the arm.
+        goals: n wrist poses with approaches.
+        start: (dof,) arm joints from which motions start [rad].
+        settings: numbers of the filter.
+    """
+    if settings.motion == "controller":
+        yield lambda rows: _controller_paths(kinematics, goals[rows], start, settings)
         return
     solutions = kinematics.solve(goals.position, goals.quaternion, settings.seeds)
-    for rank in range(settings.seeds):
-        yield partial(_tracked, kinematics, goals, solutions, rank, settings)
+    for index in range(settings.seeds):
+        yield partial(_tracked, kinematics, goals, solutions, index, settings)
 
 
 def _count(settings: ReachSettings) -> int:
-    """Postures along the approach, both ends included."""
+    """Number of postures along the approach, both ends included."""
     return 1 + max(1, round(settings.standoff / settings.spacing))
 
 
-def _servo(kinematics: InverseKinematics, goals: Goals, start: Tensor, settings: ReachSettings) -> ApproachPaths:
-    """Paths of the wrist controller; where it fails, the reason is out of reach if there is no solution at all."""
+def _controller_paths(
+    kinematics: InverseKinematics, goals: Goals, start: Tensor, settings: ReachSettings
+) -> ApproachPaths:
+    """Paths of the wrist controller; the failure is "out of reach" where the inverse kinematics finds no solution."""
     path = goals.position, goals.quaternion, goals.approach, settings.standoff
     m = roll_out(kinematics.chain, start, *path, settings.controller)
     failure = torch.where(m.reached, OK, NO_MOTION)
@@ -125,13 +136,13 @@ def _tracked(
     kinematics: InverseKinematics,
     goals: Goals,
     solutions: Solutions,
-    rank: int,
+    index: int,
     settings: ReachSettings,
     rows: Tensor,
 ) -> ApproachPaths:
-    """Paths from the solutions of one rank back to the standoff, each posture from the one before."""
+    """Approaches tracked backwards from solution `index` of each goal to the standoff, posture by posture."""
     goals, count = goals[rows], _count(settings)
-    q = solutions.q[rows, rank]
+    q = solutions.q[rows, index]
     back = torch.linspace(0, settings.standoff, count)[1:]
     places = goals.position[:, None] - goals.approach[:, None] * back[:, None]
     path, tracked = kinematics.follow(q, places, goals.quaternion[:, None].expand(-1, count - 1, 4))
@@ -139,5 +150,5 @@ def _tracked(
     time = settings.standoff / (count - 1) / settings.speed
     jumps = ((path[:, 1:] - path[:, :-1]).abs() > kinematics.chain.velocity * time).flatten(1).any(1)
     failure = torch.where(tracked.all(1) & ~jumps, OK, NOT_CONTINUOUS)
-    failure = torch.where(solutions.solved[rows, rank], failure, OUT_OF_REACH)
+    failure = torch.where(solutions.solved[rows, index], failure, OUT_OF_REACH)
     return ApproachPaths(path, [None] * len(rows), failure)

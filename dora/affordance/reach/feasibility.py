@@ -1,7 +1,7 @@
-"""Motion-feasibility filter f_reach: which candidates the arm can carry out at an object's pose, and why not.
+"""Motion-feasibility filter f_reach: which candidates the arm can reach at an object's pose, and why not the others.
 
-A candidate is feasible if the hand, opened, neither hits the table nor the object on its way along the approach, the
-arm can make that way without touching anything, and a motion leads from the start posture to its beginning.
+A candidate is feasible if the opened hand hits neither table nor object on the approach, the arm can follow the
+approach without collision, and a collision-free transit leads from the start posture to the standoff.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ from dora.robot.motion.height_bounds import ArmHeightBounds, HandHeightBounds
 from dora.robot.motion.inverse_kinematics import InverseKinematics
 from dora.robot.motion.planning import plan
 
-CLOSINGS = (0.0, 0.5, 1.0)
-"""Shares of the way from the opened hand to contact at which the hand's height over the table is taken."""
+CLOSING_SHARES = (0.0, 0.5, 1.0)
+"""Interpolation between the opened hand (0) and contact (1) at which the hand's height over the table is tested [1]."""
 IDENTITY = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 """Pose of a robot's base at the world's origin: position [m], quaternion wxyz."""
 
@@ -54,9 +54,9 @@ class Reachability:
     """Result of the filter for b object poses and c candidates.
 
     Attributes:
-        reachable: (b, c).
+        reachable: (b, c) whether the candidate is feasible.
         reason: (b, c) index into `REASONS`.
-        arm_q: (b, c, dof) arm joints at the candidate [rad]; the best attempt if it is not reachable.
+        arm_q: (b, c, dof) arm joints at the candidate [rad]; those of the best attempt if it is not reachable.
         standoff_q: (b, c, dof) arm joints at the beginning of the approach [rad], likewise.
     """
 
@@ -67,11 +67,11 @@ class Reachability:
 
     @property
     def empty(self) -> Bool[Tensor, " b"]:
-        """Poses at which no candidate is left."""
+        """(b,) poses at which no candidate is feasible."""
         return ~self.reachable.any(-1)
 
     def counts(self) -> dict[str, int]:
-        """How often each reason was given."""
+        """Number of pairs of pose and candidate by reason."""
         number = torch.bincount(self.reason.flatten(), minlength=len(REASONS))
         return {name: int(n) for name, n in zip(REASONS, number, strict=True)}
 
@@ -81,7 +81,7 @@ class Reach:
 
     Args:
         robot: arm and hand.
-        obj: has the pieces to keep clear of, in its frame; None for no object.
+        obj: the object whose convex pieces are obstacles; None for no object.
         base: pose of the robot's base in the world: position [m], quaternion wxyz.
         settings: numbers of the filter.
         start: name of the robot's posture from which motions start.
@@ -124,11 +124,11 @@ class Reach:
         """Tests every candidate at every pose of the object.
 
         Args:
-            candidates: c of them.
-            object_p: positions of the object in the world [m].
-            object_q: orientations of the object in the world, wxyz.
-            exact: False leaves out what needs Pinocchio and Coal: the hand against the object, the arm against itself
-                and the object, and everything on the way to the standoff. Arm and hand against the table remain.
+            candidates: c candidates.
+            object_p: (b, 3) positions of the object in the world [m].
+            object_q: (b, 4) orientations of the object in the world, wxyz.
+            exact: whether to test what needs Pinocchio and Coal: the hand against the object, the arm against itself
+                and the object, and the transit. Without it arm and hand are tested against the table alone.
 
         Raises:
             InputError: `exact`, and Pinocchio, Coal or (motion "plan") OMPL is not installed.
@@ -170,14 +170,25 @@ class Reach:
         object_q: Float[Tensor, " 4"],
         seed: int = 0,
     ) -> Float[np.ndarray, "k dof"] | None:
-        """Collision-free way points [rad] between two arm postures, see `dora.robot.motion.planning.plan`."""
+        """Collision-free way points (k, dof) between two arm postures [rad], or None if none are found.
+
+        Args:
+            start, goal: (dof,) arm joints [rad].
+            hand: (h,) hand joints during the motion [rad].
+            object_p: (3,) position of the object in the world [m].
+            object_q: (4,) orientation of the object in the world, wxyz.
+            seed: seed of the planner, see `dora.robot.motion.planning.plan`.
+
+        Raises:
+            InputError: Pinocchio, Coal or OMPL is not installed, or a posture is outside the joint limits.
+        """
         position, quaternion = self._in_base(object_p[None], object_q[None])
         model = self._model("transit")
         model.place_object(position[0].double().numpy(), quaternion[0].double().numpy())
         return plan(model, start, goal, hand, replace(self.settings.plan, seed=seed))
 
     def hits_object(self, candidates: GraspCandidates) -> Bool[Tensor, " c"]:
-        """Candidates whose opened hand overlaps the object on the approach; needs no pose of the object.
+        """Mask (c,) of candidates whose opened hand overlaps the object on the approach, for any pose of the object.
 
         Raises:
             InputError: Pinocchio or Coal is not installed.
@@ -187,7 +198,7 @@ class Reach:
             return hit
         model, s = self._model("hand"), self.settings
         wrist_p, wrist_q = self.wrist_pose(self.start)
-        # The arm stays; the object moves instead.
+        # The arm stays where it is; the object is moved relative to it.
         turn = quaternion_multiply(wrist_q.expand(len(candidates), 4), quaternion_inverse(candidates.quaternion))
         steps = torch.arange(0.0, s.standoff + 1e-6, s.spacing / 2)
         offsets = candidates.position[:, None] - candidates.approach[:, None] * steps[:, None]
@@ -202,17 +213,17 @@ class Reach:
         return hit
 
     def wrist_pose(self, q: Float[Tensor, " dof"]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 4"]]:
-        """Pose (m, wxyz) of the wrist in the base frame at arm joints [rad]."""
+        """Position [m] and orientation (wxyz) of the wrist in the base frame at arm joints (dof,) [rad]."""
         position, rotation = self.kinematics.chain.tip_pose(q[None])
         return position[0], quaternion_from_matrix(rotation)[0]
 
     def _in_base(self, position: Tensor, quaternion: Tensor) -> tuple[Tensor, Tensor]:
-        """World poses in the base frame."""
+        """Poses given in the world, in the base frame."""
         back = quaternion_inverse(self._base_q).expand(len(position), 4)
         return quaternion_apply(back, position - self._base_p), quaternion_multiply(back, quaternion)
 
     def _goals(self, candidates: GraspCandidates, object_p: Tensor, object_q: Tensor) -> Goals:
-        """Wrist poses of all candidates at all poses, the candidates of one pose together."""
+        """Wrist poses of all candidates at all poses in the base frame; rows of one pose are consecutive."""
         b, c = len(object_p), len(candidates)
         each = object_q.repeat_interleave(c, 0)
         return Goals(
@@ -222,10 +233,10 @@ class Reach:
         )
 
     def _hand_height(self, candidates: GraspCandidates, goals: Goals) -> Tensor:
-        """Lowest height [m] of the hand above the table on the approach and while it closes."""
+        """Smallest height of the hand above the table on the approach and while it closes (b c,) [m]."""
         heights = []
         normal = (matrix_from_quaternion(goals.quaternion).transpose(1, 2) @ self._normal)[:, None]
-        for share in CLOSINGS:
+        for share in CLOSING_SHARES:
             joints = torch.lerp(candidates.pregrasp, candidates.joints, share)
             spheres = self._hand.spheres(joints).repeat(len(goals.position) // len(candidates), 1, 1)
             heights.append(((spheres * normal).sum(-1) - self._hand.radii).amin(-1))
@@ -241,7 +252,7 @@ class Reach:
         paths: ApproachPaths,
         failure: Tensor,
     ) -> Tensor:
-        """`failure` with what Coal finds on the approach and before it."""
+        """`failure`, updated by the collisions on approach and transit."""
         failure, c = failure.clone(), len(candidates)
         position, quaternion = (x.double().numpy() for x in poses)
         hands = candidates.pregrasp.double().numpy()
@@ -257,16 +268,16 @@ class Reach:
                 failure[i] = NO_MOTION
         return failure
 
-    def _arrives(self, model: CollisionModel, way: Tensor | None, standoff: np.ndarray, hand: np.ndarray) -> bool:
-        """Whether a free motion leads from the start posture to the standoff."""
-        if way is not None:
-            return model.free(way.double().numpy(), hand)
+    def _arrives(self, model: CollisionModel, transit: Tensor | None, standoff: np.ndarray, hand: np.ndarray) -> bool:
+        """Whether a collision-free motion leads from the start posture to the standoff."""
+        if transit is not None:
+            return model.free(transit.double().numpy(), hand)
         if self.settings.motion == "none":
             return True
         return plan(model, self.start.double().numpy(), standoff, hand, self.settings.plan) is not None
 
     def _model(self, name: Literal["hand", "approach", "transit"]) -> CollisionModel:
-        """Collision models by what they test; made when first needed."""
+        """The collision model for one part of the motion, built at its first use."""
         if name not in self._models:
             s = self.settings
             clearance = {

@@ -1,7 +1,7 @@
-"""The motion-feasibility filter as a table over where an object stands, for use at every reset of an episode.
+"""The motion-feasibility filter as a table over an object's place and yaw, for a look-up at every reset of an episode.
 
-An object that rests on the table has a place (x, y) and a yaw. The filter is run once at the nodes of a grid of
-these; a reset then costs one look-up. A table is kept on disk under a digest of everything it depends on.
+An object that rests on the table has a place (x, y) and a yaw. The filter is evaluated once at the nodes of a grid
+over these; a reset then costs one look-up. A table is stored under a digest of everything on which it depends.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from dora.geometry.rotations import quaternion_apply, quaternion_inverse, quater
 from dora.robot.motion import inverse_kinematics
 
 FORMAT = "dora-reach 1"
-"""Format and version of a stored table; the version changes with the filter's meaning."""
+"""Format and version of a stored table; the version changes when the filter decides differently."""
 CHUNK = 4096
-"""Rows (poses times candidates) that are filtered at once; bounds the memory."""
+"""Rows (pairs of pose and candidate) that are filtered at once; bounds the memory."""
 MAX_TILT = 0.1
-"""Tilt from the resting orientation up to which the table applies [rad]."""
+"""Largest tilt from the resting orientation for which the table holds [rad]."""
 MAX_RISE = 0.02
-"""Distance from the resting height up to which the table applies [m]."""
+"""Largest distance from the resting height for which the table holds [m]."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,13 @@ class Grid:
     """Nodes of the table: a rectangle of places in the world, and all yaws.
 
     Attributes:
-        centre: x, y of its middle [m].
-        spread: half its width along x and y [m].
-        spacing: largest distance of two nodes along x or y [m].
+        centre: x, y of the rectangle's centre [m].
+        spread: half widths of the rectangle along x and y [m].
+        spacing: largest distance of neighbouring nodes along x or y [m].
         yaws: number of nodes on the full turn, the first at yaw 0.
+
+    Raises:
+        InputError: a spread is negative, or `spacing` or `yaws` is not positive.
     """
 
     centre: tuple[float, float]
@@ -63,7 +66,7 @@ class Grid:
 
     @property
     def steps(self) -> tuple[float, float, float]:
-        """Distance of neighbouring nodes along x, y [m] and yaw [rad]; a single node spans one spacing."""
+        """Distance of neighbouring nodes along x, y [m] and yaw [rad]; `spacing` where there is a single node."""
         x, y = (2 * half / (n - 1) if n > 1 else self.spacing for half, n in zip(self.spread, self.shape, strict=False))
         return x, y, 2 * math.pi / self.yaws
 
@@ -74,14 +77,14 @@ class Grid:
         return x, y
 
     def nodes(self) -> Float[Tensor, "m 3"]:
-        """x, y [m] and yaw [rad] of all nodes, yaw fastest."""
+        """(m, 3) x, y [m] and yaw [rad] of all nodes; yaw varies fastest, then y."""
         starts = (*self.corner, 0.0)
         return torch.cartesian_prod(
             *(start + step * torch.arange(n) for start, step, n in zip(starts, self.steps, self.shape, strict=True))
         )
 
     def nearest(self, places: Float[Tensor, "b 3"]) -> tuple[Int[Tensor, " b"], Bool[Tensor, " b"]]:
-        """Index of the node nearest to x, y [m] and yaw [rad], and whether the place is within half a cell."""
+        """Index of the node nearest to x, y [m] and yaw [rad], and whether it is at most half a cell away."""
         steps = places.new_tensor(self.steps)
         low = places.new_tensor(self.corner)
         cell = torch.cat([(places[:, :2] - low), places[:, 2:]], -1) / steps
@@ -99,10 +102,10 @@ class ReachTable:
 
     Attributes:
         grid: the nodes.
-        rest: orientation (wxyz) of the object at yaw 0.
-        height: of the resting object's origin in the world [m].
+        rest: orientation of the object at yaw 0 in the world, wxyz.
+        height: height of the resting object's origin in the world [m].
         reason: (m, c) index into `dora.affordance.reach.approach_paths.REASONS`, rows in the order of `Grid.nodes`.
-        digest: of what the table was made from.
+        digest: digest of everything on which the table depends, see `table_digest`.
     """
 
     grid: Grid
@@ -122,18 +125,18 @@ class ReachTable:
         cache: Path | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> ReachTable:
-        """Runs the filter at every node, or reads the table if it is in the object's folder or in the folder `cache`.
+        """Evaluates the filter at every node, or loads the table from the object's folder or the folder `cache`.
 
-        A run takes about half a millisecond per node and candidate, a reading a few milliseconds.
+        Evaluation takes about half a millisecond per node and candidate, loading a few milliseconds.
 
         Args:
             reach: the filter.
-            candidates: c of them.
-            grid: where the object may stand.
-            height: of the resting object's origin in the world [m]; `obj.support` on a table at height 0.
-            rest: its orientation at yaw 0, wxyz; `obj.rest`.
+            candidates: c candidates.
+            grid: places and yaws of the object.
+            height: height of the resting object's origin in the world [m]; `obj.support` on a table at height 0.
+            rest: orientation of the object at yaw 0, wxyz; `obj.rest`.
             cache: folder of stored tables; `cache_folder()` if None.
-            progress: is called with the number of nodes that are done and that of all nodes.
+            progress: called with the number of nodes done and their total.
 
         Raises:
             InputError: Pinocchio or Coal is needed and not installed.
@@ -157,9 +160,9 @@ class ReachTable:
         return table
 
     def mask(self, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]) -> Bool[Tensor, "b c"]:
-        """Feasible candidates for objects at world poses (m, wxyz); a row without any is the empty case.
+        """Mask (b, c) of feasible candidates for objects at world poses ([m], wxyz).
 
-        An object off the grid, above the table or tipped over has none.
+        An object off the grid, above the table or tipped over has none: its row is False.
         """
         place, applies = self.places(object_p, object_q)
         index, inside = self.grid.nearest(place)
@@ -168,7 +171,7 @@ class ReachTable:
     def places(
         self, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]
     ) -> tuple[Float[Tensor, "b 3"], Bool[Tensor, " b"]]:
-        """x, y [m] and yaw [rad] of objects, and whether they rest upright at the table's height."""
+        """x, y [m] and yaw [rad] of objects at world poses ([m], wxyz), and whether they rest as the table assumes."""
         rest = object_q.new_tensor(self.rest)
         turn = quaternion_multiply(object_q, quaternion_inverse(rest).expand_as(object_q))
         yaw = 2 * torch.atan2(turn[:, 3], turn[:, 0])
@@ -177,17 +180,21 @@ class ReachTable:
         return torch.cat([object_p[:, :2], yaw[:, None]], -1), level
 
     def save(self, path: Path | str) -> None:
-        """Write a safetensors file, atomically."""
+        """Write a safetensors file, atomically.
+
+        Raises:
+            InputError: it cannot be written.
+        """
         write_tensors(Path(path), FORMAT, {"reason": self.reason}, {"digest": self.digest})
 
     @classmethod
     def load(
         cls, path: Path | str, digest: str, grid: Grid, height: float, rest: tuple[float, float, float, float]
     ) -> ReachTable:
-        """Read what `save` wrote.
+        """Read a file that `save` wrote; grid, height and rest are not stored, the digest stands for them.
 
         Raises:
-            InputError: no such file, damaged, or made from something else than `digest` says.
+            InputError: no such file, damaged, or its digest differs from `digest`.
         """
         tensors, metadata = read_tensors(Path(path), FORMAT)
         if metadata["digest"] != digest:
@@ -211,7 +218,7 @@ def table_digest(
     height: float,
     rest: tuple[float, float, float, float],
 ) -> str:
-    """sha256 of everything a table depends on, numbers of the controller and the inverse kinematics included."""
+    """sha256 of everything on which a table depends, numbers of controller and inverse kinematics included."""
     robot = reach.robot
     names = ("position", "quaternion", "approach", "pregrasp", "joints")
     return digest_of(
@@ -236,7 +243,7 @@ def table_digest(
 def poses(
     nodes: Float[Tensor, "m 3"], height: float, rest: tuple[float, float, float, float]
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:
-    """World poses of an object at the nodes."""
+    """World poses ([m], wxyz) of an object that rests at the nodes (x, y [m], yaw [rad])."""
     half, zero = nodes[:, 2] / 2, torch.zeros(len(nodes))
     turn = torch.stack([half.cos(), zero, zero, half.sin()], -1)
     position = torch.cat([nodes[:, :2], torch.full((len(nodes), 1), height)], -1)

@@ -1,1 +1,1 @@
-"""From an object to grasp candidates: energies, initial poses, descent, and what is measured of the result."""
+"""Grasp search: energies, initial poses, descent, quasi-static closing, and the measurement of what results."""

@@ -1,4 +1,4 @@
-"""The grasp energy compiled for a CPU, an evaluation in a fraction of the time; `GraspEnergy` stays the definition."""
+"""The grasp energy and its descent compiled for a CPU; `GraspEnergy` and `Descent` define what they compute."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dora.affordance.objects.signed_distance import CULL, SignedDistanceField
-from dora.affordance.search.descent import MEAN_DECAY, SMALLEST, SQUARE_DECAY, Descent, Rows, Schedule
+from dora.affordance.search.descent import ADAM_EPSILON, MEAN_DECAY, SQUARE_DECAY, Descent, Rows, Schedule
 from dora.affordance.search.energies import RAMPED, TERMS, Evaluation, GraspEnergy
 from dora.affordance.search.native.energy import Adam, descend, evaluate
 from dora.affordance.search.native.field import FieldArrays
@@ -19,7 +19,7 @@ from dora.affordance.search.native.hand import HandArrays
 
 
 class CompiledEnergy(GraspEnergy):
-    """`GraspEnergy` on a CPU, compiled; arguments and results are the same."""
+    """`GraspEnergy` in compiled loops on a CPU; arguments and results are the same."""
 
     def __call__(
         self,
@@ -28,7 +28,7 @@ class CompiledEnergy(GraspEnergy):
         contacts: Int[Tensor, "c k"],
         ramp: float = 1.0,
     ) -> Evaluation:
-        """As `GraspEnergy`."""
+        """Evaluate the energy and its gradient, as `GraspEnergy.__call__`."""
         weights = self.factors(ramp)
         terms, gradient = evaluate(
             self.arrays, self.field_arrays, weights, self.plane(), wrist.numpy(), joints.numpy(), contacts.numpy()
@@ -46,22 +46,22 @@ class CompiledEnergy(GraspEnergy):
         )
 
     def factors(self, ramp: float) -> np.ndarray:
-        """Weights (terms,) times the factor on `RAMPED`."""
+        """Weights (terms,) of all terms, those in `RAMPED` multiplied by `ramp`."""
         return np.array([getattr(self.weights, name) * (ramp if name in RAMPED else 1.0) for name in TERMS])
 
     def plane(self) -> np.ndarray:
-        """Normal and offset (m) of the table, for compiled functions; infinitely far if there is none."""
+        """(4,) normal and offset [m] of the table in the object frame; an infinite offset if there is no table."""
         normal, offset = ((0.0, 0.0, 0.0), math.inf) if self.table is None else (self.table.normal, self.table.offset)
         return np.array([*normal, offset])
 
     @cached_property
     def field_arrays(self) -> FieldArrays:
-        """The object for compiled functions."""
+        """The object's distance field as arrays for compiled functions."""
         return _field_arrays(self.field)
 
     @cached_property
     def arrays(self) -> HandArrays:
-        """The hand for compiled functions."""
+        """The hand as arrays for compiled functions."""
         hand, numbers = self.hand, {}
         leader = hand.joint_gain.abs().argmax(1)
         tensors = {
@@ -95,12 +95,12 @@ class CompiledEnergy(GraspEnergy):
 
 
 class CompiledDescent(Descent):
-    """`Descent` compiled: every row takes all its steps at once."""
+    """`Descent` in compiled loops: each row takes all its steps before the next row begins."""
 
     energy: CompiledEnergy
 
     def __call__(self, rows: Rows, schedule: Schedule) -> None:
-        """As `Descent`."""
+        """Move rows in place, as `Descent.__call__`."""
         energy = self.energy
         factors = np.array([energy.factors(ramp) for ramp in schedule.ramp])
         adam = self.adam(schedule.size, schedule.before)
@@ -111,8 +111,8 @@ class CompiledDescent(Descent):
         rows.overlap = torch.from_numpy(terms[:, ramped].sum(1)).to(rows.joints)
 
     def adam(self, size: list[float], before: int = 0) -> Adam:
-        """Step sizes and decays for compiled functions."""
-        return Adam(self.largest.double().numpy(), np.array(size), before, MEAN_DECAY, SQUARE_DECAY, SMALLEST)
+        """Settings of Adam for compiled functions; `size` has the share of the largest step for each step."""
+        return Adam(self.largest.double().numpy(), np.array(size), before, MEAN_DECAY, SQUARE_DECAY, ADAM_EPSILON)
 
 
 def _field_arrays(field: SignedDistanceField) -> FieldArrays:

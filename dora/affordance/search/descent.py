@@ -1,4 +1,4 @@
-"""Descent on the grasp energy by Adam, of many candidates at once."""
+"""Descent of many candidates on the grasp energy by Adam (D. Kingma and J. Ba, 2015)."""
 
 from __future__ import annotations
 
@@ -13,18 +13,22 @@ from dora.affordance.search.energies import RAMPED, Evaluation, GraspEnergy
 from dora.geometry.rotations import matrix_from_rotation_vector
 
 MEAN_DECAY, SQUARE_DECAY = 0.9, 0.98
-"""Adam's decay rates."""
-SMALLEST = 1e-8
-"""What Adam adds to the root of the mean square of the gradient."""
+"""Adam's decay rates of the first and the second moment [1]."""
+ADAM_EPSILON = 1e-8
+"""Adam's epsilon, added to the root of the second moment."""
 
 
 @dataclass
 class Rows:
-    """Candidates under search.
+    """A batch of c candidates under search.
 
-    `wrist` (c, 4, 4) in the object frame, `joints` (c, a) in rad, `contacts` (c, k) indices of contact points,
-    `mean` and `square` (c, 6 + a) Adam's moments, `total` (c,) energy and `overlap` (c,) sum of the terms `RAMPED` (m)
-    when last looked at.
+    Attributes:
+        wrist: (c, 4, 4) wrist poses in the object frame [m].
+        joints: (c, a) actuated hand joints [rad].
+        contacts: (c, k) indices of contact points.
+        mean, square: (c, 6 + a) Adam's first and second moments.
+        total: (c,) energy at the last evaluation.
+        overlap: (c,) sum of the terms `RAMPED` at the last evaluation [m].
     """
 
     wrist: Tensor
@@ -37,7 +41,7 @@ class Rows:
 
     @classmethod
     def begin(cls, wrist: Tensor, joints: Tensor, contacts: Tensor, total: Tensor) -> Rows:
-        """Rows that have not moved yet."""
+        """Rows before their first step: moments and overlap are zero."""
         mean = joints.new_zeros(len(joints), 6 + joints.shape[1])
         return cls(wrist, joints, contacts, mean, torch.zeros_like(mean), total, torch.zeros_like(total))
 
@@ -55,8 +59,7 @@ class Rows:
 
 
 class Schedule(NamedTuple):
-    """Steps to take: how many were taken `before`, and for each the factor on `RAMPED` and the share of the largest
-    step."""
+    """Steps to take: number taken `before`; per step the factor on `RAMPED` and the share of the largest step."""
 
     before: int
     ramp: list[float]
@@ -67,15 +70,15 @@ class Descent:
     """Takes steps of Adam; rotations move along their tangent.
 
     Args:
-        energy: what is to fall.
-        largest: (6 + a,) largest steps of translation (m), rotation (rad) and joints (rad).
+        energy: the energy to minimise.
+        largest: (6 + a,) largest steps of translation [m], rotation [rad] and joints [rad].
     """
 
     def __init__(self, energy: GraspEnergy, largest: Float[Tensor, " m"]) -> None:
         self.energy, self.largest = energy, largest
 
     def __call__(self, rows: Rows, schedule: Schedule) -> None:
-        """Move rows; `total` and `overlap` become those before the last step."""
+        """Move rows in place; `total` and `overlap` become the values before the last step."""
         for step, (ramp, size) in enumerate(zip(schedule.ramp, schedule.size, strict=True), schedule.before + 1):
             found = self.energy(rows.wrist, rows.joints, rows.contacts, ramp)
             rows.total, rows.overlap = found.total, overlap(found)
@@ -83,7 +86,7 @@ class Descent:
             rows.mean.lerp_(gradient, 1 - MEAN_DECAY)
             rows.square.lerp_(gradient.square(), 1 - SQUARE_DECAY)
             mean = rows.mean / (1 - MEAN_DECAY**step)
-            root = (rows.square / (1 - SQUARE_DECAY**step)).sqrt_().add_(SMALLEST)
+            root = (rows.square / (1 - SQUARE_DECAY**step)).sqrt_().add_(ADAM_EPSILON)
             move = -size * self.largest * mean / root
             rows.wrist[:, :3, 3] += move[:, :3]
             rows.wrist[:, :3, :3] = matrix_from_rotation_vector(move[:, 3:6]) @ rows.wrist[:, :3, :3]
@@ -91,5 +94,5 @@ class Descent:
 
 
 def overlap(found: Evaluation) -> Float[Tensor, " c"]:
-    """Sum of the terms that have to vanish in the end (m)."""
+    """Sum of the unweighted terms `RAMPED`, which must vanish in the end [m]."""
     return torch.stack([found.terms[name] for name in RAMPED if name in found.terms]).sum(0)

@@ -3,17 +3,17 @@
 | term | part | value |
 |---|---|---|
 | closure | E_DFC | ||G c||^2 at the hand's contact points, c the object's inward normals there |
-| distance | E_HO | sum over contact points of abs(signed distance) (m), times `PALM_IMPORTANCE` for the palm |
-| region | E_HO | sum over contact points of the distance to the region to be held (m) |
-| closing | E_HO | sum over contact points on fingers of their miss when the hand closes a little (m) |
-| penetration | E_HO | sum over the hand's spheres of their overlap with the object and a thin skin around it (m) |
-| table | E_HO | sum over the spheres of their depth below the table plus a clearance (m) |
-| limits | E_Robot | sum over the joints of the angle beyond a limit (rad) |
-| self_penetration | E_Robot | sum over pairs of capsules that may collide of their overlap (m) |
+| distance | E_HO | sum over contact points of abs(signed distance) [m], times `PALM_IMPORTANCE` for the palm |
+| region | E_HO | sum over contact points of the distance to the region to be held [m] |
+| closing | E_HO | sum over contact points on fingers of (distance + `PRESS`)+ when the hand closes a little [m] |
+| penetration | E_HO | sum over the hand's spheres of their overlap with the object and a thin skin around it [m] |
+| table | E_HO | sum over the spheres of their depth below the table plus a clearance [m] |
+| limits | E_Robot | sum over the joints of the angle beyond a limit [rad] |
+| self_penetration | E_Robot | sum over pairs of capsules that may collide of their overlap [m] |
 
 All positions are in the object frame. A term yields its value per candidate and forces dE/dp on points of
 the hand; the principle of virtual work (`HandModel.pull_back`) turns those into the gradient with respect
-to wrist and joints. No automatic differentiation is involved, and only points that touch cost anything.
+to wrist and joints. There is no automatic differentiation, and only spheres near the object are evaluated.
 """
 
 from __future__ import annotations
@@ -26,28 +26,30 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.hand.hand_model import HandModel
-from dora.affordance.hand.protocol import STANDARD, flexion
+from dora.affordance.hand.postures import flexion
 from dora.affordance.objects.signed_distance import CHANNELS, SignedDistanceField
 
 LENGTH = 0.1
-"""Unit of length (m) of the positions psi in G, so that force and torque have comparable size."""
+"""Unit of length of the positions psi in G, so that forces and moments have comparable size [m]."""
 CLEARANCE = 3e-3
-"""Distance (m) that the hand keeps from the table."""
+"""Distance that the hand keeps from the table [m]."""
 PALM_IMPORTANCE = 3.0
-"""Factor on the distance of contact points on the palm: it cannot close towards the object as fingers do."""
+"""Factor on the term `distance` of contact points on the palm, which cannot close towards the object [1]."""
 CLOSING = 0.25
-"""Share of the protocol's squeeze by which the term `closing` closes the hand."""
+"""Share of the grasp test's squeeze by which the term `closing` closes the hand [1]."""
 PRESS = 2e-3
-"""Depth (m) in the object that a contact point should reach then."""
+"""Penetration depth that a contact point of the closed hand should reach [m]."""
 SKIN = 7e-4
-"""Overlap (m) is counted from this far outside the surface: what spheres and interpolation miss."""
-_SMALL = 1e-9
+"""Distance outside the surface from which overlap counts: the error of spheres and interpolation [m]."""
+_SMALLEST_LENGTH = 1e-9
+"""Lower bound of a length by which a vector is divided [m]."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weight of every term, per unit of the term; `docs/grasps.md` says why these."""
+    """Weight of every term, per unit of the term ([1], [1/m] or [1/rad]); docs/grasps.md gives the reasons."""
 
     closure: float = 2.0
     distance: float = 100.0
@@ -62,19 +64,19 @@ class Weights:
 TERMS = tuple(field.name for field in fields(Weights))
 """Names of the terms."""
 RAMPED = ("penetration", "table", "self_penetration")
-"""Terms whose weight grows while a search converges: they have to vanish in the end."""
+"""Terms whose weight grows while a search converges, because they must vanish in the end."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """The table as a half space of the object frame: height(p) = normal . p + offset, m above it."""
+    """The table as a plane in the object frame: the height above it is normal . p + offset [m]."""
 
     normal: tuple[float, float, float]
     offset: float
 
 
-class Push(NamedTuple):
-    """Forces dE/dp (n, 3) on points (n, 3) fixed to `body` (n,) of candidate `row` (n,)."""
+class PointForces(NamedTuple):
+    """Forces dE/dp (n, 3) on points (n, 3) of `body` (n,) of candidate `row` (n,); object frame, points in [m]."""
 
     row: Int[Tensor, " n"]
     body: Int[Tensor, " n"]
@@ -83,10 +85,10 @@ class Push(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Weighted sum `total` (c,), unweighted `terms`, and the gradient of `total`.
+    """Weighted sum `total` (c,), unweighted `terms` (c,) by name, and the gradient of `total`.
 
-    `wrist` (c, 6): with respect to the wrist's translation (m) and rotation vector (rad) about its origin,
-    both in the object frame; `joints` (c, a): with respect to the actuated joints (rad).
+    `wrist` (c, 6) is the gradient with respect to the wrist's translation [m] and rotation vector [rad] about its
+    origin, both in the object frame; `joints` (c, a) that with respect to the actuated joints [rad].
     """
 
     total: Float[Tensor, " c"]
@@ -96,13 +98,13 @@ class Evaluation(NamedTuple):
 
 
 class GraspEnergy:
-    """E of candidates of one object.
+    """The energy E of candidates of one object.
 
     Args:
         hand: the hand.
-        field: the object, with a region channel if a region is to be held.
-        weights: of the terms.
-        table: what the object rests on; None if it is free.
+        field: the object's distance field, with a region channel if a region is to be held.
+        weights: weights of the terms; the defaults if None.
+        table: the table on which the object rests; None if it is free.
     """
 
     def __init__(
@@ -127,13 +129,13 @@ class GraspEnergy:
         contacts: Int[Tensor, "c k"],
         ramp: float = 1.0,
     ) -> Evaluation:
-        """Evaluate.
+        """Evaluate the energy and its gradient.
 
         Args:
-            wrist: pose of the wrist in the object frame.
-            joints: actuated joints, rad.
-            contacts: indices into `hand.contacts` of the points that should touch.
-            ramp: factor on the weights of `RAMPED`.
+            wrist: (c, 4, 4) pose of the wrist in the object frame [m].
+            joints: (c, a) actuated joints [rad].
+            contacts: (c, k) indices into `hand.contacts` of the points that should touch.
+            ramp: factor on the weights of `RAMPED` [1].
         """
         poses = self.hand.forward(wrist, joints)
         closed = self.hand.forward(wrist, joints + self._close)
@@ -142,12 +144,12 @@ class GraspEnergy:
         found["self_penetration"] = self.self_penetration(poses)
         terms = {name: value for name, (value, _) in found.items()}
         terms["limits"], slope = self.limits(joints)
-        terms["closing"], push = self.closing(closed, contacts)
+        terms["closing"], applied = self.closing(closed, contacts)
         factor = {name: getattr(self.weights, name) * (ramp if name in RAMPED else 1.0) for name in TERMS}
-        pushes = [push._replace(force=factor[name] * push.force) for name, (_, push) in found.items()]
-        wrench = assemble(len(wrist), poses.shape[1], pushes)
+        forces = [applied._replace(force=factor[name] * applied.force) for name, (_, applied) in found.items()]
+        wrench = assemble(len(wrist), poses.shape[1], forces)
         wrist_gradient, joint_gradient = self.hand.pull_back(poses, wrench)
-        wrench = assemble(len(wrist), poses.shape[1], [push._replace(force=factor["closing"] * push.force)])
+        wrench = assemble(len(wrist), poses.shape[1], [applied._replace(force=factor["closing"] * applied.force)])
         wrist_closed, joint_closed = self.hand.pull_back(closed, wrench)
         total = torch.stack([factor[name] * value for name, value in terms.items()]).sum(0)
         joint_gradient = joint_gradient + joint_closed + factor["limits"] * slope
@@ -162,7 +164,7 @@ class GraspEnergy:
     def contact_points(
         self, poses: Float[Tensor, "c b 4 4"], contacts: Int[Tensor, "c k"]
     ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], Float[Tensor, "n 3"]]:
-        """Row, body and position (m) of n = c k contact points."""
+        """Row (n,), body (n,) and position (n, 3) in the object frame [m] of n = c k contact points."""
         count, each = contacts.shape
         row = torch.arange(count, device=contacts.device).repeat_interleave(each)
         body = self.hand.contacts.body[contacts].flatten()
@@ -170,18 +172,18 @@ class GraspEnergy:
         local = self.hand.contacts.local[contacts].view(-1, 3, 1)
         return row, body, (pose[:, :3, :3] @ local).squeeze(-1) + pose[:, :3, 3]
 
-    def closing(self, poses: Float[Tensor, "c b 4 4"], contacts: Int[Tensor, "c k"]) -> tuple[Tensor, Push]:
-        """Sum over contact points on fingers of (distance + `PRESS`)+ where `poses` are those of a closed hand."""
+    def closing(self, poses: Float[Tensor, "c b 4 4"], contacts: Int[Tensor, "c k"]) -> tuple[Tensor, PointForces]:
+        """Term `closing`: sum over finger points of (distance + `PRESS`)+ [m]; `poses` are those of the closed hand."""
         row, body, point = self.contact_points(poses, contacts)
         value, slope = self.field.sample(point, 1)
         miss = (value[:, 0] + PRESS) * (body > 0)
         force = slope[:, 0] * (miss > 0).unsqueeze(1)
-        return miss.clamp_min(0).view(contacts.shape).sum(1), Push(row, body, point, force)
+        return miss.clamp_min(0).view(contacts.shape).sum(1), PointForces(row, body, point, force)
 
     def contact_terms(
         self, poses: Float[Tensor, "c b 4 4"], contacts: Int[Tensor, "c k"]
-    ) -> dict[str, tuple[Tensor, Push]]:
-        """closure, distance and region: what asks the hand to touch, and where."""
+    ) -> dict[str, tuple[Tensor, PointForces]]:
+        """Terms `closure`, `distance` and `region`, which attract the hand, with their forces."""
         count, each = contacts.shape
         row, body, point = self.contact_points(poses, contacts)
         value, slope = self.field.sample(point)
@@ -191,12 +193,12 @@ class GraspEnergy:
         terms["distance"] = (importance * value[:, 0].abs()).view(count, each).sum(1), pull
         if self._has_region:
             terms["region"] = value[:, CHANNELS].view(count, each).sum(1), slope[:, CHANNELS]
-        return {name: (term, Push(row, body, point, force)) for name, (term, force) in terms.items()}
+        return {name: (term, PointForces(row, body, point, force)) for name, (term, force) in terms.items()}
 
     def _closure(self, point: Tensor, value: Tensor, slope: Tensor, count: int, each: int) -> tuple[Tensor, Tensor]:
         """||G c||^2 (c,) and its derivative (c k, 3) with respect to the contact points."""
         raw = value[:, 1:CHANNELS]
-        length = raw.norm(dim=-1, keepdim=True).clamp_min(_SMALL)
+        length = raw.norm(dim=-1, keepdim=True).clamp_min(_SMALLEST_LENGTH)
         inward = (-raw / length).view(count, each, 3)
         arm = (point / LENGTH).view(count, each, 3)
         force, torque = net_wrench(arm, inward)
@@ -207,8 +209,8 @@ class GraspEnergy:
         by_point = by_point + (by_raw.unsqueeze(1) @ slope[:, 1:CHANNELS]).squeeze(1)
         return force.square().sum(-1) + torque.square().sum(-1), by_point
 
-    def sphere_terms(self, poses: Float[Tensor, "c b 4 4"]) -> dict[str, tuple[Tensor, Push]]:
-        """penetration and table: what keeps the hand's spheres out of things."""
+    def sphere_terms(self, poses: Float[Tensor, "c b 4 4"]) -> dict[str, tuple[Tensor, PointForces]]:
+        """Terms `penetration` and `table`, which keep the hand's spheres out of object and table, with their forces."""
         hand = self.hand
         centers = hand.place(poses, hand.spheres)
         terms = {}
@@ -225,27 +227,34 @@ class GraspEnergy:
             terms["table"] = self._overlap(below, points, depth.flatten()[below], -normal.expand_as(points), len(poses))
         return terms
 
-    def _overlap(self, flat: Tensor, points: Tensor, depth: Tensor, slope: Tensor, count: int) -> tuple[Tensor, Push]:
+    def _overlap(
+        self, flat: Tensor, points: Tensor, depth: Tensor, slope: Tensor, count: int
+    ) -> tuple[Tensor, PointForces]:
         """Sum of positive depths of spheres with flat indices into (c, s); `slope` is d depth / d point."""
         spheres = len(self.hand.sphere_radius)
         row = flat // spheres
         value = depth.new_zeros(count).index_add_(0, row, depth.clamp_min(0))
-        return value, Push(row, self.hand.spheres.body[flat % spheres], points, slope * (depth > 0).unsqueeze(1))
+        return value, PointForces(row, self.hand.spheres.body[flat % spheres], points, slope * (depth > 0).unsqueeze(1))
 
-    def self_penetration(self, poses: Float[Tensor, "c b 4 4"]) -> tuple[Tensor, Push]:
+    def self_penetration(self, poses: Float[Tensor, "c b 4 4"]) -> tuple[Tensor, PointForces]:
         """Sum over pairs of capsules of (r_a + r_b - distance of their axes)+."""
         row, pair, first, second, gap = self.close_pairs(poses)
         overlap = -gap.clamp_max(0)
         value = overlap.new_zeros(len(poses)).index_add_(0, row, overlap)
         away = first - second
-        force = -away / away.norm(dim=-1, keepdim=True).clamp_min(_SMALL) * (gap < 0).unsqueeze(1)
+        force = -away / away.norm(dim=-1, keepdim=True).clamp_min(_SMALLEST_LENGTH) * (gap < 0).unsqueeze(1)
         body = self._capsule_body[pair].flatten()
-        return value, Push(row.repeat(2), body, torch.cat((first, second)), torch.cat((force, -force)))
+        return value, PointForces(row.repeat(2), body, torch.cat((first, second)), torch.cat((force, -force)))
 
     def close_pairs(
         self, poses: Float[Tensor, "c b 4 4"]
     ) -> tuple[Int[Tensor, " n"], Int[Tensor, "2 n"], Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-        """Pairs of capsules that may overlap: row, capsules, nearest points of their axes, gap of surfaces (m)."""
+        """Pairs of capsules whose bounding spheres meet.
+
+        Returns:
+            Row (n,), indices of the capsules (2, n), nearest points (n, 3) on the axis of each in the frame of
+            `poses` [m], and distance (n,) of the surfaces, negative where they overlap [m].
+        """
         ends = self.hand.place(poses, self.hand.ends)
         ends = ends - poses[:, None, 0, :3, 3]
         middle = 0.5 * (ends[:, 0::2] + ends[:, 1::2])
@@ -259,7 +268,7 @@ class GraspEnergy:
         return row, torch.stack((a, b)), *near, gap
 
     def limits(self, joints: Float[Tensor, "c a"]) -> tuple[Float[Tensor, " c"], Float[Tensor, "c a"]]:
-        """Sum of the angles (rad) beyond the limits of all joints, coupled ones included, and its gradient."""
+        """Term `limits`: sum of the angles beyond the limits of all joints, coupled ones included [rad]; gradient."""
         angle = self.hand.all_joints(joints)
         above, below = angle - self.hand.joint_upper, self.hand.joint_lower - angle
         value = above.clamp_min(0).sum(1) + below.clamp_min(0).sum(1)
@@ -269,13 +278,13 @@ class GraspEnergy:
 def net_wrench(
     psi: Float[Tensor, "c k 3"], normals: Float[Tensor, "c k 3"]
 ) -> tuple[Float[Tensor, "c 3"], Float[Tensor, "c 3"]]:
-    """G c of the paper: (sum of c_k, sum of [psi_k]x c_k)."""
+    """Net wrench G c of the paper: (sum of c_k, sum of psi_k x c_k) of unit forces c_k at points psi_k."""
     return normals.sum(1), torch.linalg.cross(psi, normals).sum(1)
 
 
-def assemble(count: int, bodies: int, pushes: list[Push]) -> Float[Tensor, "c b 6"]:
-    """Sum of forces, and of their moments about the object's origin, on every body of every candidate."""
-    row, body, point, force = (torch.cat(parts) for parts in zip(*pushes, strict=True))
+def assemble(count: int, bodies: int, forces: list[PointForces]) -> Float[Tensor, "c b 6"]:
+    """Wrench on each of `bodies` bodies of `count` candidates: sum of forces, and of their moments about the origin."""
+    row, body, point, force = (torch.cat(parts) for parts in zip(*forces, strict=True))
     wrench = force.new_zeros(count * bodies, 6)
     wrench.index_add_(0, row * bodies + body, torch.cat((force, torch.linalg.cross(point, force)), 1))
     return wrench.view(count, bodies, 6)
@@ -284,12 +293,15 @@ def assemble(count: int, bodies: int, pushes: list[Push]) -> Float[Tensor, "c b 
 def segment_points(
     a0: Float[Tensor, "n 3"], a1: Float[Tensor, "n 3"], b0: Float[Tensor, "n 3"], b1: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Nearest points of segments a0 a1 and b0 b1, which may have no length."""
+    """Nearest points of segments a0 a1 and b0 b1, whose lengths may be zero.
+
+    As in C. Ericson, Real-Time Collision Detection, 2004, section 5.1.9.
+    """
     u, v, w = a1 - a0, b1 - b0, a0 - b0
     uu, vv, uv = (u * u).sum(-1), (v * v).sum(-1), (u * v).sum(-1)
     uw, vw = (u * w).sum(-1), (v * w).sum(-1)
     tiny = torch.finfo(a0.dtype).tiny
-    s = ((uv * vw - uw * vv) / (uu * vv - uv * uv).clamp_min(_SMALL**2)).clamp(0, 1)
+    s = ((uv * vw - uw * vv) / (uu * vv - uv * uv).clamp_min(_SMALLEST_LENGTH**2)).clamp(0, 1)
     t = ((uv * s + vw) / vv.clamp_min(tiny)).clamp(0, 1)
     s = ((uv * t - uw) / uu.clamp_min(tiny)).clamp(0, 1)
     return a0 + s.unsqueeze(-1) * u, b0 + t.unsqueeze(-1) * v

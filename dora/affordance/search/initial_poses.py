@@ -1,4 +1,4 @@
-"""Initial hand poses: the open palm before a point of the surface, the fingers across the part to be held."""
+"""Initial hand poses: the open palm in front of a surface point, the fingers across the part to be held."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.objects.affordance_object import AffordanceObject
 
 SAMPLES = 2048
-"""Surface points to start from."""
+"""Number of surface points from which initial poses are drawn."""
 NEIGHBOURHOOD = 0.03
-"""Radius (m) in which the long axis of a part is estimated."""
+"""Radius of the neighbourhood in which the long axis of a part is estimated [m]."""
 ELONGATED = 1.5
-"""A neighbourhood whose extents along its two longest axes differ less than this ratio has no long axis."""
+"""Ratio of standard deviations along the two longest principal axes above which a neighbourhood is elongated [1]."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class Spread:
     """Random spread of initial poses.
 
     Attributes:
-        gap: range of the distance between palm and surface point (m).
-        tilt: deviation of the palm's normal from the surface's (rad, one sigma per component).
-        roll: deviation of the hand's across axis from the part's long axis (rad, one sigma).
-        abduction: deviation (rad) of joints whose range contains zero in its middle half.
-        flexion: mean and deviation of all other joints, as a share of their range.
+        gap: range of the distance between palm and surface point, uniform [m].
+        tilt: standard deviation, per component, of the palm's normal from the surface's [rad].
+        roll: standard deviation of the hand's across axis from the part's long axis [rad].
+        abduction: standard deviation of joints whose range has zero in its middle half [rad].
+        flexion: mean and standard deviation of all other joints, as shares of their range [1].
     """
 
     gap: tuple[float, float] = (-0.005, 0.025)
@@ -41,13 +41,16 @@ class Spread:
 
 
 class InitialPoses:
-    """Draws initial poses before one region of an object, or all around it.
+    """Draws initial poses in front of one region of an object, or all around it.
 
     Args:
         obj: the object.
         hand: the hand.
-        region: label to be held; None starts anywhere on the convex hull.
-        spread: of the poses.
+        region: label of the region to be held; None starts anywhere on the convex hull.
+        spread: random spread of the poses.
+
+    Raises:
+        InputError: the object has no such region.
     """
 
     def __init__(self, obj: AffordanceObject, hand: HandModel, region: str | None, spread: Spread) -> None:
@@ -63,7 +66,7 @@ class InitialPoses:
         self.center = self.points.new_tensor(palm.center)
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c a"]]:
-        """Wrist poses in the object frame and actuated joints (rad)."""
+        """Wrist poses (c, 4, 4) in the object frame [m] and actuated joints (c, a) [rad]."""
         spread, new = self.spread, self.points
 
         def normal(*shape: int) -> Tensor:
@@ -88,10 +91,10 @@ class InitialPoses:
     def _joints(self, count: int, generator: torch.Generator) -> Tensor:
         hand, spread = self.hand, self.spread
         noise = torch.randn(count, len(hand.lower), generator=generator).to(hand.lower)
-        extent = hand.upper - hand.lower
+        width = hand.upper - hand.lower
         mean, deviation = spread.flexion
-        flexed = hand.lower + extent * (mean + deviation * noise)
-        zero_share = -hand.lower / extent
+        flexed = hand.lower + width * (mean + deviation * noise)
+        zero_share = -hand.lower / width
         spreads = (zero_share > 0.25) & (zero_share < 0.75)
         return torch.clamp(torch.where(spreads, spread.abduction * noise, flexed), hand.lower, hand.upper)
 

@@ -1,4 +1,4 @@
-"""From an object to grasp candidates: the search, then what is measured and told about every candidate."""
+"""From an object to grasp candidates: the search, then the measurement, selection and classification of its rows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates, hand_digest
-from dora.affordance.hand.protocol import STANDARD, pregrasp, squeeze
+from dora.affordance.hand.grasp_test_settings import STANDARD
+from dora.affordance.hand.postures import pregrasp, squeeze
 from dora.affordance.maps.contact_semantic_map import hand_contacts, pressed_contacts
 from dora.affordance.maps.voting import NO_CONTACT, vote
 from dora.affordance.objects.affordance_object import AffordanceObject
@@ -21,7 +22,7 @@ from dora.affordance.search.compiled import CompiledEnergy
 from dora.affordance.search.descent import Rows
 from dora.affordance.search.energies import GraspEnergy, Table
 from dora.affordance.search.penetration import Penetration, self_penetration
-from dora.affordance.search.quasi_static_closing import Steps, hold
+from dora.affordance.search.quasi_static_closing import Steps, close_hand
 from dora.affordance.search.search import Search, Settings
 from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
@@ -30,15 +31,15 @@ from dora.robot import RobotDescription
 __all__ = ["Settings", "optimise"]
 
 Progress = Callable[[int, int], None]
-"""Called with the candidate-iterations done and their total."""
+"""Function that is called with the candidate-iterations done and their total."""
 OPENINGS = (0.25, 0.5, 0.75, 1.0)
-"""Shares of the protocol's opening that are tried."""
+"""Shares of the grasp test's opening that are tried, ascending in equal steps [1]."""
 OPENING_DEPTH = 1e-3
-"""Overlap (m) with the object up to which a finger counts as clear of it."""
-SHALLOW = 9e-4
-"""Penetration (m) above which a candidate comes after those with less."""
+"""Penetration depth up to which an opened finger counts as clear of the object [m]."""
+SHALLOW_PENETRATION = 9e-4
+"""Penetration depth above which a candidate comes after those with less [m]."""
 SEATING = Steps(closing=60, settling=20, weight=0)
-"""Steps of the hand that closes around the object."""
+"""Steps of the quasi-static closing around the object after the search, without load."""
 NO_CLASS = "NoContact"
 """Grasp class of a candidate without contact."""
 
@@ -56,18 +57,18 @@ def optimise(
     """Search for grasps of an object.
 
     Args:
-        obj: object.
-        robot: whose hand it is.
-        num: candidates wanted.
-        seed: of all random draws; equal seeds give equal candidates.
-        region: label to be held; None leaves it open.
-        settings: of the search.
+        obj: the object.
+        robot: the robot whose hand grasps.
+        num: number of candidates.
+        seed: seed of all random draws; equal seeds give equal candidates.
+        region: label of the region to be held; None for any.
+        settings: settings of the search; the defaults if None.
         device: torch device of the search and of the result.
-        progress: called with candidate-iterations done and their total.
+        progress: called with the candidate-iterations done and their total.
 
     Returns:
-        `num` candidates in the object frame, best first. `valid` tells which stay below the protocol's limit
-        of penetration at the candidate; whether a grasp holds is for a simulation to say.
+        `num` candidates in the object frame, best first. `valid` says whether the penetration depth at the candidate
+        is within the grasp test's limit; whether the grasp withstands the test is decided by simulation.
 
     Raises:
         InputError: `num` is less than 1, the object has no such region, or it is too large for a hand.
@@ -107,7 +108,7 @@ def batch_seed(seed: int, index: int) -> int:
 
 
 def table_of(obj: AffordanceObject) -> Table:
-    """The table under an object at rest, in the object frame."""
+    """The table under a resting object, in the object frame."""
     up = matrix_from_quaternion(torch.tensor(obj.rest, dtype=torch.float64))[2].tolist()
     return Table((up[0], up[1], up[2]), obj.support)
 
@@ -115,15 +116,15 @@ def table_of(obj: AffordanceObject) -> Table:
 def _candidates(
     obj: AffordanceObject, energy: GraspEnergy, rows: Rows, num: int, settings: Settings
 ) -> GraspCandidates:
-    """The `num` best rows, measured and classified."""
+    """The `num` best rows as candidates: fewest faults first, then highest quality."""
     hand, robot = energy.hand, energy.hand.robot
     found = energy(rows.wrist, rows.joints, rows.contacts, settings.ramp)
     poses = hand.forward(rows.wrist, rows.joints)
     depth, self_depth = Penetration(hand, energy.field)(poses), self_penetration(energy, poses)
     faults = 4 * (depth > STANDARD.penetration).long() + 2 * (self_depth > STANDARD.strict_self_penetration).long()
-    faults += (depth > SHALLOW).long()
-    judged = faults.argsort(stable=True)[: _judged(faults, num)]
-    quality, predicted, closed = _quality(obj, energy, rows, found.total, judged, num)
+    faults += (depth > SHALLOW_PENETRATION).long()
+    selected = faults.argsort(stable=True)[: _selected_count(faults, num)]
+    quality, predicted, closed = _quality(obj, energy, rows, found.total, selected, num)
     order = quality.argsort(descending=True)
     best = order[faults[order].argsort(stable=True)][:num]
     poses, joints, wrist = poses[best], rows.joints[best], rows.wrist[best]
@@ -131,7 +132,7 @@ def _candidates(
         points, finger = hand_contacts(hand, energy.field, poses)
     else:
         points, finger = pressed_contacts(hand, energy.field, closed[best])
-    held = vote(map_of(obj, str(points.device)), points, finger)
+    voted = vote(map_of(obj, str(points.device)), points, finger)
     full = robot.expand_hand(joints)
     normal = full.new_tensor(hand.palm_frame.normal)
     return GraspCandidates(
@@ -141,7 +142,7 @@ def _candidates(
         approach=wrist[:, :3, :3] @ normal,
         pregrasp=opened(energy, wrist, full),
         grasp=squeeze(robot, full),
-        grasp_class=tuple(NO_CLASS if label == NO_CONTACT else obj.classes[label] for label in held.tolist()),
+        grasp_class=tuple(NO_CLASS if label == NO_CONTACT else obj.classes[label] for label in voted.tolist()),
         joints=full,
         contacts=points,
         contact_finger=finger,
@@ -156,58 +157,67 @@ def _candidates(
     )
 
 
-def _judged(faults: Tensor, num: int) -> int:
-    """How many rows are worth judging: all without fault, but at least as many as are wanted."""
+def _selected_count(faults: Tensor, num: int) -> int:
+    """Number of rows whose quality is computed: all without fault, but at least `num`."""
     return max(num, int((faults == 0).sum()))
 
 
 def _quality(
-    obj: AffordanceObject, energy: GraspEnergy, rows: Rows, total: Tensor, judged: Tensor, num: int
+    obj: AffordanceObject, energy: GraspEnergy, rows: Rows, total: Tensor, selected: Tensor, num: int
 ) -> tuple[Tensor, dict[str, Tensor], Tensor | None]:
-    """What candidates are ranked by (c,), more is better, the predictions it is made of, and poses (c, b, 4, 4) of the
-    closed hand, for the rows judged; of which the `num` best are wanted."""
+    """Quality (c,) of the selected rows, of which the `num` best must be exact; others have -inf.
+
+    Returns:
+        Quality, more is better; the model's predictions (c,) by name, nan for other rows; and poses (c, b, 4, 4) of
+        the closed hand in the object frame, None where the energy is not compiled and -E is the quality.
+    """
     if not isinstance(energy, CompiledEnergy):
         return -total, {}, None
     robot = energy.hand.robot
-    full = robot.expand_hand(rows.joints[judged])
-    held = hold(energy, rows.wrist[judged], pregrasp(robot, full), squeeze(robot, full), obj.mass, wanted=num)
+    full = robot.expand_hand(rows.joints[selected])
+    closed_hand = close_hand(
+        energy, rows.wrist[selected], pregrasp(robot, full), squeeze(robot, full), obj.mass, wanted=num
+    )
 
     def spread(values: Tensor, missing: float) -> Tensor:
-        return torch.full_like(total, missing).index_copy_(0, judged, values)
+        return torch.full_like(total, missing).index_copy_(0, selected, values)
 
     predictions = {
-        "predicted_shift": spread(held.shift, math.nan),
-        "predicted_displacement": spread(held.displacement[:, -1], math.nan),
-        "predicted_force": spread(held.force, math.nan),
+        "predicted_shift": spread(closed_hand.shift, math.nan),
+        "predicted_displacement": spread(closed_hand.displacement[:, -1], math.nan),
+        "predicted_force": spread(closed_hand.force, math.nan),
     }
-    closed = energy.hand.forward(held.wrist, robot.reduce_hand(held.joints))
-    poses = closed.new_full((len(total), *closed.shape[1:]), math.nan).index_copy_(0, judged, closed)
-    return spread(held.quality, -math.inf), predictions, poses
+    closed = energy.hand.forward(closed_hand.wrist, robot.reduce_hand(closed_hand.joints))
+    poses = closed.new_full((len(total), *closed.shape[1:]), math.nan).index_copy_(0, selected, closed)
+    return spread(closed_hand.quality, -math.inf), predictions, poses
 
 
 def seated(energy: CompiledEnergy, rows: Rows, mass: float, squeezed: float) -> Rows:
-    """Rows after their hands have closed around the object; what a squeeze then adds is force.
+    """Rows after quasi-static closing around the object, with all contacts made.
 
     Args:
-        energy: knows hand, object and table.
-        rows: with the fingers about where they should touch.
-        mass: of the object (kg).
-        squeezed: how far the command goes beyond the posture (rad).
+        energy: its hand, object and table are used.
+        rows: rows whose fingers are near the points that they should touch.
+        mass: mass of the object [kg].
+        squeezed: angle by which the command goes beyond the posture [rad].
     """
     robot = energy.hand.robot
     full = robot.expand_hand(rows.joints)
     closed = squeeze(robot, full, replace(STANDARD, squeeze=squeezed))
-    held = hold(energy, rows.wrist, pregrasp(robot, full), closed, mass, steps=SEATING, on_table=True)
-    return replace(rows, wrist=held.wrist.contiguous(), joints=robot.reduce_hand(held.joints))
+    closed_hand = close_hand(energy, rows.wrist, pregrasp(robot, full), closed, mass, steps=SEATING, on_table=True)
+    return replace(rows, wrist=closed_hand.wrist.contiguous(), joints=robot.reduce_hand(closed_hand.joints))
 
 
 def opened(energy: GraspEnergy, wrist: Float[Tensor, "c 4 4"], joints: Float[Tensor, "c j"]) -> Float[Tensor, "c j"]:
-    """The protocol's open hand, every finger opened only as far as it stays clear of the object behind it.
+    """The open hand of the grasp test, each finger opened only as far as it stays clear of the object behind it.
 
     Args:
-        energy: knows hand and object.
-        wrist: pose of the wrist in the object frame.
-        joints: all hand joints in contact (rad), in the order of `RobotDescription.hand`.
+        energy: its hand and object are used.
+        wrist: (c, 4, 4) pose of the wrist in the object frame [m].
+        joints: (c, j) all hand joints in contact [rad], in the order of `RobotDescription.hand`.
+
+    Returns:
+        (c, j) hand joints before closing [rad], in the same order.
     """
     hand = energy.hand
     wide = pregrasp(hand.robot, joints)

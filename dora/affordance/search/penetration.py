@@ -1,4 +1,4 @@
-"""What a finished grasp is judged by: exact penetration of the object and of the hand itself."""
+"""Exact penetration depths of a finished grasp: of the hand with the object, and of the hand with itself."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.objects.signed_distance import SignedDistanceField
 from dora.affordance.search.energies import GraspEnergy
 
-DENSE = 1e-4
-"""Sagitta (m) of the dense spheres: their union is at most this much thinner than the capsules."""
+DENSE_SAGITTA = 1e-4
+"""Sagitta of the dense spheres: their union is at most this much thinner than the capsules [m]."""
 FIELD_ERROR = 2e-3
-"""Bound (m) on the field's error near the surface; spheres farther away are not measured exactly."""
+"""Bound on the field's error near the surface; spheres farther away are not measured exactly [m]."""
 
 
 class Penetration:
-    """Deepest overlap of the hand with the object, by exact distances at dense samples of the capsules' axes."""
+    """Penetration depth of the hand in the object, by exact distances of dense spheres on the capsules' axes."""
 
     def __init__(self, hand: HandModel, field: SignedDistanceField) -> None:
         self.hand, self.field = hand, field
-        self.spheres, self.radius = hand.sphere_set(sagitta=DENSE)
+        self.spheres, self.radius = hand.sphere_set(sagitta=DENSE_SAGITTA)
 
     def __call__(self, poses: Float[Tensor, "c b 4 4"]) -> Float[Tensor, " c"]:
-        """Deepest overlap (m) of every row, at least 0; `poses` as of `HandModel.forward`."""
+        """Largest penetration depth of every row, at least 0 [m]; `poses` as from `HandModel.forward`, object frame."""
         centers = self.hand.place(poses, self.spheres)
         near = self.field.may_touch(centers, self.radius + FIELD_ERROR)
         points = centers.view(-1, 3)[near]
@@ -36,6 +36,6 @@ class Penetration:
 
 
 def self_penetration(energy: GraspEnergy, poses: Float[Tensor, "c b 4 4"]) -> Float[Tensor, " c"]:
-    """Deepest overlap (m) of two capsules of the hand that may collide, at least 0."""
+    """Largest penetration depth (c,) of two capsules of the hand that may collide, at least 0 [m]."""
     row, _, _, _, gap = energy.close_pairs(poses)
     return gap.new_zeros(len(poses)).scatter_reduce_(0, row, (-gap).clamp_min(0), "amax")

@@ -1,9 +1,9 @@
 """Gradient descent on the grasp energy from many initial poses at once.
 
-Every row is one candidate. Adam moves wrist and joints; now and then half of the contact points of a row
-are drawn anew and kept if its energy is lower. A row starts as the best of several draws; after a part of the
-iterations only the better rows stay; the weights of terms that must vanish grow in the last part; rows that
-have converged leave the batch.
+Each row of a batch is one candidate. Adam moves wrist and joints. At intervals half of the contact points of a row are
+drawn again, and the new ones are kept if they lower its energy. A row starts as the best of several draws; after a
+share of the iterations only the better rows stay; the weights of terms that must vanish grow towards the end; rows
+that have converged leave the batch.
 """
 
 from __future__ import annotations
@@ -30,26 +30,31 @@ class Settings:
 
     Attributes:
         iterations: gradient steps per candidate.
-        contacts: contact points per candidate: one on the palm, one on the thumb (the first finger), the others on
-            the other fingers in random order, and on any finger beyond that.
-        weights: of the energy terms.
-        ramp: factor on the weights of penetration, table and self-penetration at the end.
-        ramp_start: share of the iterations after which the ramp begins.
-        resample: iterations between attempts to draw contact points anew.
-        resample_until: share of the iterations after which contact points stay.
-        starts: initial poses drawn per candidate; the best is taken.
-        field_size: rows started per candidate; at the share `halving` of the iterations only the best stay.
-        halving: see `field_size`.
-        settle: share of the iterations after which rows that have converged stop.
-        oversampling: candidates finished per candidate asked for; the best are returned.
-        seat: how far the hand then closes around the object (rad), for contacts that are not made yet; 0: not at all.
-        polish: gradient steps that remove overlaps after that.
-        translation: largest step of the wrist (m).
-        rotation: largest rotation of the wrist in a step (rad).
-        joint: largest step of a joint (rad).
-        batch: candidates searched at once; more does not fit a core's cache.
-        table: keep the hand above the table on which the object rests; None: if it is on one before it is grasped.
-        spread: of the initial poses.
+        contacts: contact points per candidate: one on the palm, one on the thumb (the first finger), then one on
+            each other finger in random order, then on random fingers.
+        weights: weights of the energy terms.
+        ramp: factor on the weights of penetration, table and self-penetration at the end [1].
+        ramp_start: share of the iterations after which the ramp begins [1].
+        resample: iterations between attempts to draw contact points again.
+        resample_until: share of the iterations after which contact points stay [1].
+        starts: initial poses drawn per candidate, of which the best is taken.
+        field_size: rows started per candidate; at the share `halving` of the iterations only the best stay [1].
+        halving: see `field_size` [1].
+        settle: share of the iterations after which converged rows leave the batch [1].
+        oversampling: candidates finished per candidate asked for; the best are returned [1].
+        seat: angle by which the hand closes around the object after the search, to make missing contacts [rad]; 0
+            leaves this out.
+        polish: gradient steps after that, which remove overlaps.
+        polish_weights: weights of the energy terms in those steps.
+        translation: largest translation of the wrist in a step [m].
+        rotation: largest rotation of the wrist in a step [rad].
+        joint: largest change of a joint in a step [rad].
+        batch: rows searched at once; larger batches exceed a core's cache.
+        table: whether to keep the hand above the object's table; None: if it is on one before it is grasped.
+        spread: random spread of the initial poses.
+
+    Raises:
+        InputError: a count is below 1.
     """
 
     iterations: int = 40
@@ -81,19 +86,25 @@ class Settings:
 
 
 CHECK = 5
-"""Iterations between checks for rows that have settled."""
+"""Iterations between checks for converged rows."""
 SETTLED = 2e-3
-"""Relative change of the energy between two checks below which a row has settled."""
+"""Relative change of the energy between two checks below which a row has converged [1]."""
 TOLERANCE = 1e-4
-"""Sum of overlaps (m) that a settled row may have, skin included."""
+"""Largest sum of overlaps of a converged row, skin included [m]."""
 POLISH_STEP = 0.5
-"""Largest steps of polishing, in those of the search."""
+"""Ratio of the largest steps of polishing to those of the search [1]."""
 LAST_STEP = 0.01
-"""Share of the step sizes that is left at the end of the cosine schedule."""
+"""Share of the step sizes at the end of the cosine schedule [1]."""
 
 
 class Search:
-    """Gradient search of one object with one hand."""
+    """Gradient search for grasps of one object with one hand.
+
+    Args:
+        energy: the energy to minimise.
+        initial: source of initial poses.
+        settings: settings of the search.
+    """
 
     def __init__(self, energy: GraspEnergy, initial: InitialPoses, settings: Settings) -> None:
         self.energy, self.initial, self.settings = energy, initial, settings
@@ -106,7 +117,7 @@ class Search:
         self._points = [(hand.contact_part == part).nonzero().squeeze(1) for part in parts]
 
     def run(self, count: int, generator: torch.Generator, progress: Callable[[int], None]) -> Rows:
-        """Search and return `count` candidates; `progress` gets the number of rows times the steps they took."""
+        """Search and return `count` candidates; `progress` is called with the candidate-iterations of each stretch."""
         settings, hand = self.settings, self.energy.hand
         rows = self.start(math.ceil(count * settings.field_size), generator)
         last = settings.iterations
@@ -155,7 +166,7 @@ class Search:
         return Rows.begin(wrist[best], joints[best], contacts[best], total[best])
 
     def draw_contacts(self, count: int, generator: torch.Generator) -> Int[Tensor, "c k"]:
-        """Random contact points: palm, first finger, the other fingers in random order, then any finger."""
+        """Random contact points, indices into `hand.contacts`, on the parts that `Settings.contacts` describes."""
         fingers, contacts = len(self._points) - 1, self.settings.contacts
         others = torch.rand(count, fingers - 1, generator=generator).argsort(1) + 2
         extra = torch.randint(1, fingers + 1, (count, contacts), generator=generator)
@@ -167,7 +178,7 @@ class Search:
         return every[(starts[part] + (share * sizes[part]).long()).to(every.device)]
 
     def _resample(self, rows: Rows, ramp: float, generator: torch.Generator) -> None:
-        """Draw half of the contact points anew; keep them where the energy is lower."""
+        """Draw half of the contact points again; keep them where the energy is lower."""
         fresh = self.draw_contacts(len(rows), generator)
         stay = (torch.rand(fresh.shape, generator=generator) < 0.5).to(fresh.device)
         fresh = torch.where(stay, rows.contacts, fresh)
@@ -175,7 +186,7 @@ class Search:
         rows.contacts = torch.where((then < now).unsqueeze(1), fresh, rows.contacts)
 
     def polish(self, rows: Rows, iterations: int) -> Rows:
-        """Descend from where rows are: full weights on overlaps, the nearest points as contacts."""
+        """Rows after `iterations` more steps, with the full weights on overlaps and the nearest points as contacts."""
         settings, hand = self.settings, self.energy.hand
         rows = Rows.begin(rows.wrist, rows.joints, self.nearest_contacts(rows), rows.total)
         sizes = [POLISH_STEP * fading(step / iterations) for step in range(iterations)]
@@ -184,7 +195,7 @@ class Search:
         return rows
 
     def nearest_contacts(self, rows: Rows) -> Int[Tensor, "c k"]:
-        """The nearest point of the palm, and of the nearest of the other links."""
+        """Per row the nearest point of the palm and of those other links that are nearest to the object."""
         hand = self.energy.hand
         points = hand.place(hand.forward(rows.wrist, rows.joints), hand.contacts)
         distance = self.energy.field.distance(points).abs()

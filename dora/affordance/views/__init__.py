@@ -1,1 +1,1 @@
-"""Pictures and the web page of objects, maps and grasps; nothing here computes a grasp."""
+"""Pictures and the web page of objects, affordance maps and grasps."""

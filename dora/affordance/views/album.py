@@ -1,4 +1,4 @@
-"""The pictures that show an object and its grasps, as files: regions, some grasps, their contact semantic maps."""
+"""Picture files of an object: its regions, some of its grasps, and their contact semantic maps."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from dora.errors import InputError
 from dora.robot import RobotDescription
 
 SHOWN = 4
-"""Grasps in a picture."""
+"""Largest number of grasps in a picture."""
 EDGE = 0.002
-"""Longest edge of the triangles of a contact semantic map [m]."""
+"""Longest edge of the triangles that carry the colours of a contact semantic map [m]."""
 OBJECTS = "objects.png"
-"""Name of the picture of all objects."""
+"""File name of the picture of all objects."""
 
 
 def write_album(
@@ -30,9 +30,9 @@ def write_album(
 
     Args:
         obj: the object.
-        candidates: of this object, best first; `chosen` ones are shown.
-        robot: whose hand grasps.
-        folder: for the files.
+        candidates: candidates of this object, best first, of which `chosen` are shown; None for the regions only.
+        robot: the robot whose hand grasps.
+        folder: folder of the files, created if missing.
 
     Raises:
         InputError: the folder or a file cannot be written.
@@ -52,7 +52,7 @@ def write_album(
 
 
 def write_objects(folder: Path) -> Path:
-    """Write a picture of all of Dora's objects into a folder; returns its path.
+    """Write a picture of all bundled objects into a folder; returns its path.
 
     Raises:
         InputError: the folder or the file cannot be written.
@@ -70,7 +70,7 @@ def _make(folder: Path) -> None:
 
 
 def chosen(candidates: GraspCandidates) -> list[int]:
-    """Rows of at most `SHOWN` grasps: the first valid one of every class, then the first of all others."""
+    """Rows of at most `SHOWN` valid grasps (of any if none is valid): the first of every class, then the next ones."""
     valid = candidates.valid.nonzero()[:, 0].tolist() or list(range(len(candidates)))
     names = candidates.grasp_class
     first = [row for i, row in enumerate(valid) if names[row] not in {names[other] for other in valid[:i]}]

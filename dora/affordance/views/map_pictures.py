@@ -1,4 +1,4 @@
-"""Pictures and 3D files of affordance maps."""
+"""Pictures and glTF files of affordance maps."""
 
 from pathlib import Path
 from typing import cast
@@ -15,21 +15,21 @@ from dora.affordance.views.sheet import Panel, write_sheet
 from dora.files import write_bytes
 
 VIEWS = ((-1.0, 0.35), (2.4, 0.35))
-"""Azimuth and elevation (rad) of the pictures."""
+"""Azimuth and elevation of the views [rad]."""
 PLAIN = (225, 225, 225, 255)
-"""Colour of the surface under the points."""
+"""Colour of the surface under the points: red, green, blue, opacity, 0 to 255."""
 DISC_CORNERS, DISC_SHARE, DISC_LIFT = 8, 0.85, 2e-4
-"""Corners of a point's disc, its radius as a share of that with its area, and its distance (m) from the surface."""
+"""Corners of a point's disc, ratio of its radius to that of a disc of the point's area, height over the surface [m]."""
 
 
 def painted(map: AffordanceMap) -> trimesh.Trimesh:
-    """The surface with each face in the colour of its region (object frame, m)."""
+    """The surface in the object frame [m], each face in the colour of its region."""
     rgba = colours(map.face_labels, PALETTE)
     return trimesh.Trimesh(map.mesh.vertices, map.mesh.faces, face_colors=rgba, process=False)
 
 
 def discs(map: AffordanceMap) -> trimesh.Trimesh:
-    """Every point as a disc as large as the area for which it stands, in the colour of its region."""
+    """Each point as a disc, about as large as the area that it represents, in the colour of its region [m]."""
     angle = torch.linspace(0, 2 * torch.pi, DISC_CORNERS + 1)[:-1]
     first = torch.linalg.cross(map.normals, torch.eye(3)[map.normals.abs().argmin(1)])
     first = torch.nn.functional.normalize(first, dim=-1)
@@ -48,9 +48,9 @@ def picture_map(map: AffordanceMap, path: Path | str, size: int = 400) -> None:
     """Write a PNG: the painted surface from the front and from behind, and the points as discs on it.
 
     Args:
-        map: what to draw.
-        path: of the file.
-        size: side of each of the three views (pixels).
+        map: the map to draw.
+        path: path of the file.
+        size: side of each of the three views [pixels].
 
     Raises:
         InputError: the file cannot be written.
@@ -71,5 +71,9 @@ def picture_map(map: AffordanceMap, path: Path | str, size: int = 400) -> None:
 
 
 def export_glb(map: AffordanceMap, path: Path | str) -> None:
-    """Write the painted surface as binary glTF (m), which every 3D viewer shows; InputError if it cannot be written."""
+    """Write the coloured surface as binary glTF [m].
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     write_bytes(Path(path), cast(bytes, trimesh.Scene(painted(map)).export(file_type="glb")))

@@ -1,4 +1,4 @@
-"""A web page with an object, its regions, and the hand at each of its grasps."""
+"""The web page, served by viser, of an object, its regions, and the hand at each of its grasps."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ from dora.geometry.rotations import quaternion_from_matrix
 from dora.robot import RobotDescription
 
 MOST_HANDS = 16
-"""Hands that a page can show at once."""
+"""Largest number of hands that a page shows at once."""
 EDGE = 0.004
 """Longest edge of the triangles that carry colours [m]."""
 MOST_CUTS = 12
-"""Times that a triangle is cut at most."""
+"""Largest number of times that a triangle is subdivided."""
 CONTACT_SIZE = 0.004
-"""Size of a contact point [m]."""
+"""Diameter of a contact point [m]."""
 VIEWPOINT = 1.0
-"""Distance of the first view along x and y, in diagonals of the object."""
+"""Distance of the first view along x and y, in diagonals of the object [1]."""
 AMBIENT = 1.5
-"""Intensity of the light from everywhere; viser's own lights leave dark links black."""
+"""Intensity of the ambient light; with viser's own lights alone dark links are black [1]."""
 REGIONS, CONTACTS = "affordance regions", "contacts of the grasp"
-"""What the surface's colours can mean."""
+"""Choices of what the colours of the surface mean."""
 ANY_VALIDITY, VALID, INVALID = "all", "valid", "not valid"
 """Choices of the filter by validity."""
 
 
 @dataclass(frozen=True)
 class Filter:
-    """Which candidates are shown.
+    """Conditions on the candidates that are shown.
 
     Attributes:
-        classes: grasp classes.
+        classes: grasp classes that are shown.
         validity: "all", "valid" or "not valid".
         term: energy term to filter by; None for no such filter.
-        share: of the candidates of all classes, those with the lowest value of `term`, 0 to 1.
+        share: share of the candidates of all classes with the lowest values of `term` that are shown, 0 to 1 [1].
     """
 
     classes: frozenset[str]
@@ -58,7 +58,7 @@ class Filter:
     share: float = 1.0
 
     def rows(self, candidates: GraspCandidates) -> Int[Tensor, " m"]:
-        """Indices of the candidates that pass, in their order."""
+        """Indices (m,) of the candidates that pass, ascending."""
         mask: Bool[Tensor, " c"] = candidates.of_class(*self.classes)
         if self.validity != ANY_VALIDITY:
             mask = mask & (candidates.valid == (self.validity == VALID))
@@ -69,7 +69,7 @@ class Filter:
 
 
 def describe(candidates: GraspCandidates, row: int) -> str:
-    """Markdown about one candidate: class, verdict, overlaps, contacts and energies."""
+    """Markdown about one candidate: class, validity, score, penetration depths, contacts and energies."""
     names = list(PARTS)
     touching = sorted({int(f) for f in candidates.contact_finger[row] if f > 0})
     score = float(candidates.score[row])
@@ -86,7 +86,7 @@ def describe(candidates: GraspCandidates, row: int) -> str:
 
 
 class Surface:
-    """The object's mesh, cut into triangles with edges of at most `edge` [m], which carry colours."""
+    """The object's mesh, subdivided into triangles with edges of at most `edge` [m], each with a colour."""
 
     def __init__(self, obj: AffordanceObject, edge: float = EDGE) -> None:
         vertices, faces, *origin = trimesh.remesh.subdivide_to_size(
@@ -105,18 +105,18 @@ class Surface:
         return colours(self.parts(candidates, row, hand), tuple(PARTS.values()))
 
     def parts(self, candidates: GraspCandidates, row: int, hand: HandModel) -> Int[np.ndarray, " f"]:
-        """The contact semantic map of one candidate: what touches each face, an index into `PARTS`."""
+        """The contact semantic map of one candidate: for each face the part of the hand, an index into `PARTS`."""
         one = candidates.select([row])
         part = contact_semantic_map(self.centres, one.position, one.quaternion, one.joints, hand)
         return part[0].numpy()
 
     def painted(self, face_colours: UInt8[np.ndarray, "f 4"]) -> trimesh.Trimesh:
-        """The mesh in these colours, faces not sharing vertices."""
+        """The mesh in these face colours, with separate vertices for each face."""
         return unshared(self.mesh, face_colours)
 
 
 def unshared(mesh: trimesh.Trimesh, face_colours: np.ndarray) -> trimesh.Trimesh:
-    """A mesh of which every face has its own vertices, so that colours keep their edges in glTF, stored linear."""
+    """A mesh with separate vertices for each face, so that glTF keeps the edges between colours, which are linear."""
     linear = (255 * (face_colours[:, :3] / 255) ** GAMMA).round()
     corners = mesh.triangles.reshape(-1, 3)
     normals = mesh.vertex_normals[mesh.faces].reshape(-1, 3)
@@ -130,7 +130,7 @@ def unshared(mesh: trimesh.Trimesh, face_colours: np.ndarray) -> trimesh.Trimesh
 
 
 class Hands:
-    """Up to `MOST_HANDS` posed hands; links of equal shape are one batch."""
+    """Up to `MOST_HANDS` posed hands in a scene of viser; links of equal shape form one batch."""
 
     def __init__(self, scene: Any, robot: RobotDescription) -> None:
         self.mesh = HandMesh(robot)
@@ -170,7 +170,7 @@ class Hands:
 
 
 def _filled(values: list[Float[Tensor, "c d"]], rest: tuple[float, ...]) -> Float[np.ndarray, "n d"]:
-    """Rows of every link, each filled up to `MOST_HANDS` with `rest`."""
+    """Rows of every link, padded to `MOST_HANDS` each with `rest`."""
     table = np.tile(np.array(rest, dtype=np.float32), (len(values), MOST_HANDS, 1))
     for link, value in enumerate(values):
         table[link, : len(value)] = value.numpy()
@@ -181,11 +181,11 @@ class GraspPage:
     """A running page; callbacks of its widgets change the scene.
 
     Args:
-        obj: object.
+        obj: the object.
         candidates: its grasps, or None to show the regions only.
-        robot: whose hand it is.
-        port: of the page; a port in use is refused.
-        host: address to listen on; the default is reached from this machine only.
+        robot: the robot whose hand grasps.
+        port: port of the page; a port in use is refused.
+        host: address to listen on; with the default the page is reachable from this machine only.
 
     Attributes:
         server: viser's server; `server.stop()` ends the page.
@@ -263,7 +263,7 @@ class GraspPage:
 
     @property
     def filter(self) -> Filter:
-        """What the widgets say."""
+        """The filter that the widgets show."""
         return Filter(
             frozenset(name for name, box in self.classes.items() if box.value),
             self.validity.value,
@@ -272,7 +272,7 @@ class GraspPage:
         )
 
     def refresh(self) -> None:
-        """Show what the widgets ask for: the chosen grasp among those that pass, and the ones after it."""
+        """Update the scene by the widgets: the chosen grasp among those that pass the filter, and the next ones."""
         assert self.candidates is not None
         rows = self.filter.rows(self.candidates).tolist()
         first = min(self.chosen.value - 1, max(len(rows) - 1, 0))
@@ -306,7 +306,11 @@ class GraspPage:
 
 
 def start_server(host: str, port: int, label: str) -> Any:
-    """viser's server on exactly this port; InputError if viser is missing or the port is in use."""
+    """Start viser's server on exactly this port.
+
+    Raises:
+        InputError: viser is not installed, or the port is in use.
+    """
     try:
         viser = importlib.import_module("viser")
     except ImportError as error:

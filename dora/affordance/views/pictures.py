@@ -1,4 +1,4 @@
-"""PNG pictures of objects, grasps and contact semantic maps, on any machine."""
+"""PNG pictures of objects, grasps and contact semantic maps, drawn without a graphics driver."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ PARTS = {
     "ring": (89, 161, 79),
     "pinky": (78, 121, 167),
 }
-"""Classes of a contact semantic map and their colours."""
+"""Colours (red, green, blue, 0 to 255) of the classes 0 to 6 of a contact semantic map."""
 TILE = 420
 """Width and height of one view [pixels]."""
 OBJECT_VIEW = (-1.0, 0.35)
 """Azimuth and elevation of the views of objects [rad]."""
 VIEW = (0.6, 0.5)
-"""Azimuth, where there is nothing to look at, and elevation of the views of contact maps [rad]."""
+"""Azimuth of the view of a contact map without contacts, and elevation of all of them [rad]."""
 AZIMUTHS, ELEVATIONS = 8, (0.15, 0.55)
-"""Number of azimuths and the elevations [rad] from which a grasp may be seen."""
+"""Number of azimuths, and the elevations [rad], among which the view of a grasp is chosen."""
 PREVIEW = 64
-"""Width and height of the views by which the best one is chosen [pixels]."""
-GRIPPED = 0.03
-"""Distance to a contact point up to which a surface counts as held [m]."""
+"""Width and height of the small views by which the best one is chosen [pixels]."""
+CONTACT_NEIGHBOURHOOD = 0.03
+"""Largest distance to a contact point of the faces that a view should show [m]."""
 MILLIMETRES = 1000.0
-"""Per metre."""
+"""Millimetres per metre [1]."""
 
 
 def coloured(obj: AffordanceObject) -> trimesh.Trimesh:
@@ -50,7 +50,11 @@ def coloured(obj: AffordanceObject) -> trimesh.Trimesh:
 
 
 def picture_objects(objects: Sequence[AffordanceObject], path: Path | str) -> None:
-    """Write a PNG of objects with the names and colours of their regions. Every object fills its view."""
+    """Write a PNG of objects with the names and colours of their regions; every object fills its view.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     panels = []
     for obj in objects:
         mesh = coloured(obj)
@@ -63,16 +67,26 @@ def picture_objects(objects: Sequence[AffordanceObject], path: Path | str) -> No
 def picture_grasps(
     candidates: GraspCandidates, obj: AffordanceObject, robot: RobotDescription, path: Path | str, columns: int = 4
 ) -> None:
-    """Write a PNG with one view of every candidate: give a few, `columns` to a row.
+    """Write a PNG with one view of every candidate, the hand in its posture at contact.
 
-    The hand is in its posture at contact, seen from where it and what it holds are seen best.
+    The view of each is that of `best_view`.
+
+    Args:
+        candidates: a few candidates.
+        obj: their object.
+        robot: the robot whose hand grasps.
+        path: path of the file.
+        columns: views in a row.
+
+    Raises:
+        InputError: the file cannot be written.
     """
     mesh, panels = coloured(obj), []
-    vertices, faces, *_ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, GRIPPED)
+    vertices, faces, *_ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, CONTACT_NEIGHBOURHOOD)
     cut = trimesh.Trimesh(vertices, faces, process=False)
     model = HandMesh(robot)
     for row, hand in enumerate(model.posed(candidates.position, candidates.quaternion, candidates.joints)):
-        camera = best_view(cut, hand, _held(candidates, row, cut.triangles_center), model.fingers)
+        camera = best_view(cut, hand, _near_contacts(candidates, row, cut.triangles_center), model.fingers)
         view = render([mesh, hand], camera, TILE, TILE)
         panels.append(Panel(view, caption(candidates, row)))
     write_sheet(panels, path, min(columns, len(panels)), legend_of(obj.labels), obj.name)
@@ -85,14 +99,17 @@ def picture_contacts(
     name: str,
     path: Path | str,
 ) -> None:
-    """Write a PNG of contact semantic maps, each seen from where most of its contacts are and from the other side.
+    """Write a PNG of contact semantic maps, each from the side with most of its contacts and from the opposite one.
 
     Args:
-        mesh: the object's surface, fine enough to carry colours.
-        faces: per map the class of every face, 0..6.
-        titles: of the maps.
-        name: of the object.
-        path: of the file.
+        mesh: the object's surface, subdivided finely enough to carry colours [m].
+        faces: per map the class (f,) of every face, 0 to 6.
+        titles: titles of the maps.
+        name: name of the object.
+        path: path of the file.
+
+    Raises:
+        InputError: the file cannot be written.
     """
     table = tuple(PARTS.values())
     front, back = [], []
@@ -106,13 +123,13 @@ def picture_contacts(
 
 
 def _towards(mesh: trimesh.Trimesh, faces: np.ndarray) -> float:
-    """Azimuth [rad] of a view from the side to which most of the area of some faces looks."""
+    """Azimuth of the mean normal of a mask of faces, weighted by area [rad]."""
     x, y, _ = (mesh.area_faces * faces) @ mesh.face_normals
     return float(np.arctan2(y, x)) if np.hypot(x, y) > 0 else VIEW[0]
 
 
 def caption(candidates: GraspCandidates, row: int) -> str:
-    """Class, deepest overlap and, if ranked, the score of a candidate."""
+    """Class, penetration depth and, if ranked, the score of a candidate."""
     words = [candidates.grasp_class[row]]
     depth, score = float(candidates.penetration[row]), float(candidates.score[row])
     if np.isfinite(depth):
@@ -123,30 +140,30 @@ def caption(candidates: GraspCandidates, row: int) -> str:
 
 
 def best_view(
-    mesh: trimesh.Trimesh, hand: trimesh.Trimesh, held: Bool[np.ndarray, " f"], fingers: Bool[np.ndarray, " h"]
+    mesh: trimesh.Trimesh, hand: trimesh.Trimesh, touched: Bool[np.ndarray, " f"], fingers: Bool[np.ndarray, " h"]
 ) -> Camera:
-    """The camera, of those around, that sees most of an object's held faces and most of the hand's fingers.
+    """The camera around both meshes with the largest product of visible touched faces and visible fingers, in pixels.
 
     Args:
-        mesh: the object.
-        hand: in its posture.
-        held: which faces of the object count.
-        fingers: which faces of the hand count.
+        mesh: the object [m].
+        hand: the hand in its posture, in the same frame [m].
+        touched: (f,) mask of the faces of the object that count.
+        fingers: (h,) mask of the faces of the hand that count.
     """
-    grip = np.concatenate([held, np.zeros(len(fingers) + 1, bool)])
-    grasping = np.concatenate([np.zeros(len(held), bool), fingers, [False]])
+    part = np.concatenate([touched, np.zeros(len(fingers) + 1, bool)])
+    finger = np.concatenate([np.zeros(len(touched), bool), fingers, [False]])
 
     def worth(camera: Camera) -> int:
         found = seen([mesh, hand], camera, PREVIEW, PREVIEW)
-        return int(grip[found].sum()) * int(grasping[found].sum())
+        return int(part[found].sum()) * int(finger[found].sum())
 
     azimuths = 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
     return max((Camera.around([mesh, hand], float(a), e) for a in azimuths for e in ELEVATIONS), key=worth)
 
 
-def _held(candidates: GraspCandidates, row: int, centres: np.ndarray) -> Bool[np.ndarray, " f"]:
-    """Which faces, of given centres (f, 3) [m], are near a contact of a candidate; all if it has none."""
+def _near_contacts(candidates: GraspCandidates, row: int, centres: np.ndarray) -> Bool[np.ndarray, " f"]:
+    """Mask (f,) of faces with centres (f, 3) [m] near a contact of a candidate; all if it has no contact."""
     points = candidates.contacts[row][candidates.contact_finger[row] > 0].numpy()
     if not len(points):
         return np.ones(len(centres), bool)
-    return np.linalg.norm(centres[:, None] - points, axis=-1).min(1) < GRIPPED
+    return np.linalg.norm(centres[:, None] - points, axis=-1).min(1) < CONTACT_NEIGHBOURHOOD

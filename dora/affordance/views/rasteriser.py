@@ -1,4 +1,4 @@
-"""Pictures of coloured triangles by a depth buffer in NumPy: no GPU, no graphics driver, no window."""
+"""Rasteriser of coloured triangles with a depth buffer in NumPy, without GPU, graphics driver or window."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from jaxtyping import Float, Int, UInt8
 from dora.affordance.hand.hand_mesh import face_colours
 
 OVERSAMPLING = 2
-"""Pixels rendered per side of a pixel shown, against jagged edges."""
+"""Pixels rendered along each side of a pixel shown, for antialiasing."""
 DEPTHS = 1 << 40
-"""Steps into which the inverse depth is divided."""
+"""Number of steps into which the inverse depth is quantised."""
 CHUNK = 2_000_000
-"""Pixels tested at a time; bounds the memory."""
+"""Pixels tested at once; bounds the memory."""
 MARGIN = 1.06
-"""Factor of the lengths across the view, for a margin around what is shown."""
+"""Ratio of the width of a view to that of the meshes in it, for a margin [1]."""
 LIGHT = (-0.35, 0.45, 0.82)
-"""Direction towards the light along the picture's right, its up and towards the viewer (unnormalised)."""
+"""Direction towards the light, not normalised: components to the right, up, and towards the viewer."""
 AMBIENT = 0.6
-"""Share of a face's colour that it shows when turned from the light."""
+"""Brightness of a face that is turned away from the light, relative to its colour [1]."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Camera:
     """A pinhole camera.
 
     Attributes:
-        eye: (x, y, z) where it is [m].
-        target: (x, y, z) what it looks at [m].
+        eye: (x, y, z) position of the camera [m].
+        target: (x, y, z) point at the picture's centre [m].
         up: direction that is up in the picture.
         field: full vertical opening angle [rad].
     """
@@ -43,7 +43,7 @@ class Camera:
 
     @classmethod
     def around(cls, meshes: Sequence[trimesh.Trimesh], azimuth: float, elevation: float, field: float = 0.6) -> Camera:
-        """Looks at the middle of meshes from a direction [rad], as near as a square picture of them may be."""
+        """A camera at azimuth and elevation [rad] from the centre of meshes, as near as they fit a square picture."""
         points = np.concatenate([mesh.vertices for mesh in meshes])
         target = (points.min(0) + points.max(0)) / 2
         away = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
@@ -54,7 +54,7 @@ class Camera:
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """Rows: right, up and towards the viewer, in the frame of the meshes."""
+        """Rotation matrix from the frame of the meshes to the camera: rows are right, up and towards the viewer."""
         back = np.subtract(self.eye, self.target)
         back /= np.linalg.norm(back)
         right = np.cross(self.up, back)
@@ -72,13 +72,13 @@ def render(
     """Picture of face-coloured meshes with diffuse light, both sides of a face shown.
 
     Args:
-        meshes: in one frame [m]; what lies behind the camera must not exist.
-        camera: from where.
-        width, height: of the picture [pixels].
-        background: red, green and blue, 0..255.
+        meshes: face-coloured meshes in one frame, all in front of the camera [m].
+        camera: the camera.
+        width, height: size of the picture [pixels].
+        background: red, green and blue, 0 to 255.
 
     Returns:
-        (height, width, 3) red, green and blue.
+        (height, width, 3) red, green and blue, 0 to 255.
     """
     turn, corners = camera.rotation, _corners(meshes, camera)
     normals = np.concatenate([mesh.face_normals for mesh in meshes]) @ turn.T
@@ -94,15 +94,15 @@ def render(
 
 
 def seen(meshes: list[trimesh.Trimesh], camera: Camera, width: int, height: int) -> Int[np.ndarray, "h w"]:
-    """Index of the face seen in every pixel, counted through all meshes; the number of all faces where there is none.
+    """Index of the face that is visible in every pixel, counted through all meshes; the number of faces where none is.
 
-    Arguments as of `render`.
+    Arguments as for `render`.
     """
     return _nearest_faces(_project(_corners(meshes, camera), camera.field, (height, width)), (height, width))
 
 
 def _corners(meshes: list[trimesh.Trimesh], camera: Camera) -> Float[np.ndarray, "f 3 3"]:
-    """Corners of all faces [m] along the picture's right, its up and towards the viewer, from the eye."""
+    """Corners of all faces in the camera frame: to the right, up and towards the viewer, from the eye [m]."""
     return (np.concatenate([mesh.triangles for mesh in meshes]) - np.asarray(camera.eye)) @ camera.rotation.T
 
 
@@ -117,10 +117,10 @@ def _project(corners: np.ndarray, field: float, size: tuple[int, int]) -> Float[
 
 
 def _nearest_faces(faces: Float[np.ndarray, "f 3 3"], size: tuple[int, int]) -> Int[np.ndarray, "h w"]:
-    """Index of the face seen in every pixel; the number of faces where there is none.
+    """Index of the face that is visible in every pixel; the number of faces where none is.
 
-    The inverse depth is linear in the picture, so barycentric coordinates interpolate it exactly. Index and depth
-    share one integer, so that one maximum per pixel decides both.
+    The inverse depth is linear in the picture, so barycentric coordinates interpolate it exactly. Index and depth are
+    packed into one integer, so that one maximum per pixel finds both.
     """
     height, width = size
     low = np.clip(np.ceil(faces[..., :2].min(1) - 0.5), 0, [width, height]).astype(np.int64)
@@ -141,7 +141,7 @@ def _nearest_faces(faces: Float[np.ndarray, "f 3 3"], size: tuple[int, int]) -> 
 
 
 def _barycentric(corners: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which points (x, y) lie in their triangles, and the inverse depth there."""
+    """Whether points (x, y) [pixels] lie in their triangles, and the inverse depth there [1/m]."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Sheets of pictures: several views in a grid, with titles and legends, as one PNG."""
+"""Sheets of pictures: views in a grid with titles and legends, as one PNG file."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from matplotlib.patches import Patch
 from dora.files import write_bytes
 
 Legend = Mapping[str, tuple[int, int, int]]
-"""Colours (red, green and blue, 0..255) by what they mean."""
+"""Colours (red, green and blue, 0 to 255) by their meaning."""
 DPI = 100
-"""Pixels per inch of figures."""
+"""Resolution of figures, pixels per inch."""
 TITLE, LEGEND = 34, 50
-"""Room for a row of titles and for a row of legends [pixels]."""
+"""Height of a row of titles and of a row of legends [pixels]."""
 SIZE = 9
-"""Of letters [points]."""
+"""Size of letters [points]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One view: its pixels (h, w, 3), the title above it and, if it has colours of its own, the legend below it."""
+    """One view: its pixels (h, w, 3), the title above it, and the legend of its own colours below it, if any."""
 
     view: UInt8[np.ndarray, "h w 3"]
     title: str
@@ -39,10 +39,10 @@ def write_sheet(
     """Write views of one size as a PNG.
 
     Args:
-        panels: row by row.
-        path: of the file.
-        columns: views in a row.
-        legend: of all views together.
+        panels: the views, row by row.
+        path: path of the file.
+        columns: number of views in a row.
+        legend: legend of all views together; none if None.
         name: title of that legend.
 
     Raises:

@@ -20,8 +20,10 @@ from dora.agents.collecting.task_env import Task, TaskEnv, TaskFactory
 from dora.agents.learners.networks import Policy
 from dora.errors import InputError
 
-SHUTDOWN_SECONDS = 10.0  # workers that have not ended by then are killed
-LESS_URGENT = 5  # niceness of workers beside a busy learner, which all wait for
+SHUTDOWN_SECONDS = 10.0
+"""Time after which workers that have not ended are killed [s]."""
+LESS_URGENT = 5
+"""Niceness of workers beside a busy learner, for which all of them wait [1]."""
 
 
 class WorkerTaskEnv(TaskEnv):

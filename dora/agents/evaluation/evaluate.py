@@ -11,8 +11,10 @@ from torch import Tensor
 
 from dora.agents.collecting.task_env import EpisodeColumns, TaskEnv
 
-PERIODIC_SEED = 1_000_000_000  # first episode seed of evaluations during training; training seeds are below
-FINAL_SEED = 1_500_000_000  # first episode seed of the evaluation that a result reports
+PERIODIC_SEED = 1_000_000_000
+"""First episode seed of evaluations during training; training seeds are below."""
+FINAL_SEED = 1_500_000_000
+"""First episode seed of the evaluation that a result reports."""
 
 Act = Callable[[Float[Tensor, "n o"]], Float[Tensor, "n a"]]
 

@@ -19,7 +19,8 @@ from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.learner import make_learner
 from dora.agents.learners.networks import Policy
 
-FRAMES_PER_SECOND = 20  # of a film, if the task does not say its control frequency
+FRAMES_PER_SECOND = 20
+"""Frame rate of a film if the task does not say its control frequency [1/s]."""
 
 
 def checkpoint_path(path: Path) -> Path:

@@ -17,12 +17,18 @@ from tensordict.nn import (
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
-CLIP = 6.0  # normalised observations stay within this many standard deviations
-VARIANCE_FLOOR = 1e-4  # keeps components that never change finite
-FIRST_OUTPUT_SCALE = 0.05  # shrinks the last layer: a new actor corrects nothing, a new critic has no opinion
-LOG_STD_MIN = -4.0  # smallest state-dependent log standard deviation, before the tanh
-LOG_STD_START = 2.0  # output of a new actor that stands for a log standard deviation 0.13 below its bound
-TANH_MARGIN = 1e-6  # keeps log(1 - tanh^2) finite
+CLIP = 6.0
+"""Bound of normalised observations, in standard deviations [1]."""
+VARIANCE_FLOOR = 1e-4
+"""Smallest variance of an observation, which keeps components that never change finite."""
+FIRST_OUTPUT_SCALE = 0.05
+"""Factor on the initial weights of the last layer, so that a new network returns about zero [1]."""
+LOG_STD_MIN = -4.0
+"""Smallest state-dependent log standard deviation, before the tanh [1]."""
+LOG_STD_START = 2.0
+"""Output of a new actor that stands for a log standard deviation 0.13 below its bound [1]."""
+TANH_MARGIN = 1e-6
+"""Margin that keeps log(1 - tanh^2) finite [1]."""
 
 
 def mlp(sizes: Sequence[int], activation: type[nn.Module], layer_norm: bool = False) -> nn.Sequential:

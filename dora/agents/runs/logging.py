@@ -38,8 +38,10 @@ TAGS: dict[str, str] = {
     "speed/learn_share": "share of wall time since the start spent learning",
     "speed/evaluate_share": "share of wall time since the start spent evaluating",
 }
+"""TensorBoard tags and what they mean."""
 
 LOSSES = frozenset(tag.removeprefix("loss/") for tag in TAGS if tag.startswith("loss/"))
+"""Names of the losses that have a tag."""
 
 
 def tags_table() -> str:

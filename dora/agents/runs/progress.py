@@ -6,7 +6,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-LINE_SECONDS = 10.0  # between two plain lines
+LINE_SECONDS = 10.0
+"""Time between two plain lines of progress [s]."""
 
 
 class ProgressReport:

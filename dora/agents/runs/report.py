@@ -19,12 +19,14 @@ COLOURS = {
 }
 """Line colour of each learner with and without guidance; others take matplotlib's."""
 CURVE_COLUMNS = ("env_steps", "wall_seconds", "success_rate", "return_mean", "penetration_p95_mm")
+"""Columns of a learning curve that the report reads."""
 HEADINGS = (
     "task", "preset", "agent", "guidance", "seeds", "success %", "scripted (zero correction) %", "penetration p95 mm",
     "steps", "minutes",
 )  # fmt: skip
 """Of the table."""
 SECONDS_PER_MINUTE = 60.0
+"""Seconds per minute [s]."""
 
 DEFAULT_PRESET = "standard"
 """Preset of a run of a Dora task that names none."""

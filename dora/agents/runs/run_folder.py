@@ -17,6 +17,7 @@ from dora.errors import InputError
 from dora.files import write_bytes, write_csv, write_json
 
 PACKAGES = ("dora", "mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
+"""Packages whose versions are written."""
 CURVE_HEADER = (
     "env_steps",
     "wall_seconds",
@@ -25,6 +26,7 @@ CURVE_HEADER = (
     "penetration_p95_mm",
     "training_success_rate",
 )
+"""Columns of a learning curve."""
 
 
 @dataclasses.dataclass(frozen=True)

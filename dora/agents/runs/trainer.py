@@ -33,8 +33,10 @@ from dora.agents.runs.logging import RunLog
 from dora.agents.runs.progress import ProgressReport
 from dora.agents.runs.run_folder import RunFolder, make_result
 
-TRAINING_SEEDS = 1_000_000_000  # seeds of training are below, those of evaluation above
-RECENT = 200  # training episodes over which the shown success rate is taken
+TRAINING_SEEDS = 1_000_000_000
+"""Bound of the seeds: those of training are below, those of evaluation above."""
+RECENT = 200
+"""Number of training episodes over which the shown success rate is taken."""
 
 
 def seeds_for(seed: int, step: int, count: int) -> list[int]:

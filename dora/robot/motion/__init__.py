@@ -1,1 +1,1 @@
-"""How the arm moves: inverse kinematics, collisions, planning, and the wrist controller without a simulator."""
+"""Motion of the arm: inverse kinematics, collisions, planning, and rollouts of the wrist controller."""

@@ -1,7 +1,7 @@
-"""Collisions of the robot with itself, a table and an object, by Pinocchio and Coal.
+"""Collision tests of the robot with itself, a table and an object, by Pinocchio and Coal.
 
-The geometry is that of the `RobotDescription`, so capsules stay capsules (Pinocchio's URDF parser refuses them). The
-fingers against each other are left out: they depend on the candidate alone, not on where the arm is.
+The geometry is that of the `RobotDescription`, so capsules stay capsules (Pinocchio's URDF parser refuses them).
+Collisions between fingers are not tested: they depend on the candidate alone, not on the posture of the arm.
 """
 
 from __future__ import annotations
@@ -20,15 +20,17 @@ from dora.errors import InputError
 from dora.robot import RobotDescription, Shape
 
 Z_TO_X = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-"""Turns z, the axis of Coal's capsules and cylinders, into x, the axis of a `Shape`."""
+"""Rotation of z, the axis of Coal's capsules and cylinders, into x, the axis of a `Shape`."""
 TABLE = "table"
+"""Name of the table as a part, and of the pairs with it."""
 OBJECT = "object"
+"""Name of the object as a part."""
 KINDS = ("arm", TABLE, "arm object", "hand object")
-"""Kinds of pairs of parts; the fingers against each other are none."""
+"""Kinds of pairs of parts that can be tested."""
 
 
 class _Part(NamedTuple):
-    """A shape: the link, "table" or "object" it belongs to, Pinocchio's joint, pose in its frame, Coal's geometry."""
+    """One shape: its owner (a link, "table" or "object"), Pinocchio's joint, pose in its frame, Coal's geometry."""
 
     owner: str
     joint: int
@@ -51,16 +53,16 @@ def need(module: str, package: str) -> ModuleType:
 
 
 class CollisionModel:
-    """Which parts of robot, table and object touch at a posture.
+    """Collision model of robot, table and object, which says what touches at a posture.
 
     Args:
-        robot: links and pairs that collide.
-        pieces: convex shapes of the object, in its frame; none for no object.
-        table: (4,) plane in the robot's base frame as (normal, height along it [m]); everything below is solid.
-            Links that the arm's joints do not move stand on it and are not tested against it.
-        clearance: kinds of pairs that are tested, with the distance [m] up to which such a pair counts as touching;
-            negative values allow that much overlap. The kinds are "arm" (a link of the arm with one of the arm or
-            hand), "table" (arm or hand), "arm object" and "hand object". By default all, at 0.
+        robot: the robot, with its shapes and ignored pairs.
+        pieces: convex shapes of the object in its frame [m]; empty for no object.
+        table: (4,) plane in the robot's base frame: unit normal and height along it [m]; the half space below is
+            solid. Links that the arm's joints do not move are not tested against it.
+        clearance: kinds of pairs that are tested, and for each the distance [m] up to which a pair counts as touching;
+            a negative value is an allowed penetration depth. The kinds are "arm" (a link of the arm with one of the
+            arm or hand), "table" (arm or hand), "arm object" and "hand object". By default all, with 0.
 
     Raises:
         InputError: Pinocchio or Coal is not installed, or `clearance` has an unknown kind.
@@ -84,12 +86,12 @@ class CollisionModel:
         clearance = dict.fromkeys(KINDS, 0.0) if clearance is None else clearance
         if unknown := set(clearance) - set(KINDS):
             raise InputError(f"there are no pairs of the kind {min(unknown)!r}; choose from {', '.join(KINDS)}")
-        # The broad phase knows no margin of an unbounded shape: the plane itself is raised.
+        # The broad phase has no margin for an unbounded shape: the plane itself is raised.
         plane = self._coal.Halfspace(np.array(table[:3]), table[3] + clearance.get(TABLE, 0.0))
         parts = [*self._robot_parts(), _Part(TABLE, 0, pin.SE3.Identity(), plane)]
         parts += [_Part(OBJECT, 0, local, body) for body, local in map(self._solid, pieces)]
         pairs = _tested(robot, [part.owner for part in parts], clearance)
-        # Nor may it hold a shape without a pair: that one's bounding box would be undefined.
+        # Nor may it contain a shape without a pair, whose bounding box would be undefined.
         used = sorted({index for i, j, _ in pairs for index in (i, j)})
         self._geometry, place = pin.GeometryModel(), {}
         self._pieces: list[tuple[Any, Any]] = []
@@ -107,13 +109,13 @@ class CollisionModel:
         self._broad = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager(self._model, self._geometry, self._results)
 
     def place_object(self, position: Float[np.ndarray, " 3"], quaternion: Float[np.ndarray, " 4"]) -> None:
-        """Move the object to a pose (m, wxyz) in the robot's base frame."""
+        """Move the object to a pose ([m], wxyz) in the robot's base frame."""
         pose = self._pose(position, quaternion)
         for part, local in self._pieces:
             part.placement = pose * local
 
     def touching(self, arm: Float[np.ndarray, " dof"], hand: Float[np.ndarray, " h"]) -> tuple[str, str] | None:
-        """A pair of parts (link, then link, "table" or "object") that touch at these joints [rad], or None."""
+        """A pair of parts (a link, then a link, "table" or "object") that touch at joint angles [rad], or None."""
         if not self._collide(arm, hand):
             return None
         for index, pair in enumerate(self._pairs):
@@ -122,7 +124,7 @@ class CollisionModel:
         return None
 
     def free(self, arms: Float[np.ndarray, "k dof"], hand: Float[np.ndarray, " h"]) -> bool:
-        """Whether nothing touches at any of the postures [rad]."""
+        """Whether nothing touches at any of k postures of the arm with one posture of the hand [rad]."""
         return not any(self._collide(arm, hand) for arm in arms)
 
     def _collide(self, arm: np.ndarray, hand: np.ndarray) -> bool:
@@ -142,7 +144,7 @@ class CollisionModel:
         return self._pin.SE3(self._pin.Quaternion(w, x, y, z).normalized().matrix(), np.asarray(position, dtype=float))
 
     def _solid(self, shape: Shape | trimesh.Trimesh) -> tuple[Any, Any]:
-        """Coal's geometry of a shape, and its pose in the frame the shape is given in."""
+        """Coal's geometry of a shape, and its pose in the frame in which the shape is given."""
         coal = self._coal
         if isinstance(shape, trimesh.Trimesh):
             points = coal.StdVec_Vec3s()
@@ -158,7 +160,7 @@ class CollisionModel:
 
 
 def _tested(robot: RobotDescription, owners: Sequence[str], clearance: dict[str, float]) -> list[tuple[int, int, str]]:
-    """Pairs of indices into `owners` that are tested, with their kind."""
+    """Pairs of indices into `owners` that are tested, and the kind of each."""
     moving = {link for link in robot.shapes if any(joint.moves for joint in robot.model.chain(link))}
     hand, found = hand_links(robot), []
     for (i, a), (j, b) in itertools.combinations(enumerate(owners), 2):
@@ -174,7 +176,7 @@ def _tested(robot: RobotDescription, owners: Sequence[str], clearance: dict[str,
 
 
 def hand_links(robot: RobotDescription) -> frozenset[str]:
-    """The wrist link and every link it carries, of those with collision shapes."""
+    """Names of the wrist link and all links that it carries, of those with collision shapes."""
     wrist = robot.wrist_link
     return frozenset(
         link

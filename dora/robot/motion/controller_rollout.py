@@ -1,8 +1,8 @@
-"""Arm motions under the tasks' wrist controller, without a simulator: many at once, kinematics only.
+"""Rollouts of the tasks' wrist controller without a simulator: batched and purely kinematic.
 
-The wrist moves straight to the standoff of a candidate and then straight down to it. Each control step is a
-displacement of bounded length that becomes joint steps by damped least squares within position and velocity limits,
-so the branch of the inverse kinematics, stalls at joint limits and slow singular passages are those of the task.
+The wrist moves straight to the standoff of a candidate and then straight along the approach. Each control step is a
+displacement of bounded length, turned into joint steps by damped least squares within position and velocity limits.
+The branch of the inverse kinematics, stalls at joint limits and slow motion near singularities are those of the task.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from dora.robot.motion.inverse_kinematics import LIMIT_MARGIN, pose_error
 
 @dataclass(frozen=True)
 class Controller:
-    """Numbers of the wrist controller and of the reference that commands it, as far as a motion depends on them.
+    """Numbers of the wrist controller and of its reference on which a motion depends.
 
     Attributes:
-        period: of the control [s].
-        speed: fastest translation of the wrist [m/s].
-        spin: fastest rotation of the wrist [rad/s].
+        period: control period [s].
+        speed: largest speed of the wrist [m/s].
+        spin: largest angular speed of the wrist [rad/s].
         descent: speed at which the standoff shrinks [m/s].
-        arrived: error at the standoff that begins the descent [m], [rad].
-        settled: error that counts as having reached the candidate [m], [rad]; half of what lets the tasks' hand close.
-        patience: control steps after which a motion has failed.
+        arrived: errors at the standoff below which the descent begins [m], [rad].
+        settled: errors below which the candidate is reached [m], [rad]; half of what closes the tasks' hand.
+        patience: number of control steps after which a motion has failed.
     """
 
     period: float = 0.05
@@ -43,13 +43,13 @@ class Controller:
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """n motions of t control steps; a finished motion stays where it is.
+    """n motions of t control steps; after its end a motion is constant.
 
     Attributes:
         q: (n, t, dof) commanded arm joints [rad].
-        arrival: (n,) step at which the descent begins; t - 1 if it never does.
-        finish: (n,) step at which the wrist came to the candidate; t - 1 if it never did.
-        reached: (n,) whether it did.
+        arrival: (n,) index of the step at which the descent begins; t - 1 if it never does.
+        finish: (n,) index of the step at which the wrist reaches the candidate; t - 1 if it never does.
+        reached: (n,) whether the wrist reaches the candidate.
     """
 
     q: Float[Tensor, "n t dof"]
@@ -70,13 +70,16 @@ def roll_out(
     """Motions from one posture to many wrist poses.
 
     Args:
-        chain: from the robot's root to the wrist.
-        start: arm joints [rad].
-        position: of the wrist at the candidate, in the base frame [m].
-        quaternion: of the wrist at the candidate, wxyz.
-        approach: unit direction of the last part of the motion.
-        standoff: length of that part [m].
+        chain: chain from the robot's root to the wrist.
+        start: (dof,) arm joints at the start [rad].
+        position: (n, 3) wrist at the candidate, in the base frame [m].
+        quaternion: (n, 4) wrist at the candidate, in the base frame, wxyz.
+        approach: (n, 3) unit direction of the approach, in the base frame.
+        standoff: length of the approach [m].
         controller: numbers of the controller.
+
+    Returns:
+        The motions; t is the number of steps until the last one has ended, plus one.
     """
     c = controller
     n, lower, upper = len(position), chain.lower + LIMIT_MARGIN, chain.upper - LIMIT_MARGIN

@@ -1,7 +1,7 @@
-"""How low the hand and the arm reach: heights above a plane, batched and exact for all shapes but cylinders.
+"""Lower bounds of the heights of hand and arm above a plane, batched, and exact for all shapes but cylinders.
 
-Every collision shape is the convex hull of equal spheres: a capsule of two, a box of eight with radius zero. Its
-lowest point over a plane is that of the lowest sphere. The rim of a cylinder is a polygon drawn around the circle.
+Each collision shape is the convex hull of equal spheres: a capsule of two, a box of eight with radius zero. Its lowest
+point is that of its lowest sphere. The rim of a cylinder is replaced by a circumscribed polygon.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from dora.robot.kinematics import Frames
 from dora.robot.motion.collision import hand_links
 
 RIM_POINTS = 16
-"""Points on each rim of a cylinder."""
+"""Number of corners of the polygon around each rim of a cylinder."""
 
 
 def spheres_of(shape: Shape) -> tuple[Float[np.ndarray, "m 3"], float]:
-    """Centres [m] in the link frame and the common radius [m] of spheres with the shape as their convex hull."""
+    """Centres in the link frame [m] and common radius [m] of spheres whose convex hull contains the shape."""
     centre = np.asarray(shape.position)
     if shape.kind == "sphere":
         return centre[None], shape.size[0]
@@ -41,14 +41,14 @@ def spheres_of(shape: Shape) -> tuple[Float[np.ndarray, "m 3"], float]:
 
 
 def _spheres(robot: RobotDescription, link: str) -> tuple[Tensor, Tensor]:
-    """Centres (m, 3) and radii (m,) of all shapes of a link."""
+    """Centres (m, 3) in the link frame and radii (m,) of the spheres of all shapes of a link [m]."""
     parts = [spheres_of(shape) for shape in robot.shapes[link]]
     centres = torch.tensor(np.concatenate([points for points, _ in parts]), dtype=torch.float32)
     return centres, torch.tensor(np.repeat([r for _, r in parts], [len(p) for p, _ in parts]), dtype=torch.float32)
 
 
 class HandHeightBounds:
-    """The hand as spheres in the frame of its wrist link."""
+    """The hand as m spheres in the frame of its wrist link."""
 
     def __init__(self, robot: RobotDescription):
         above = len(robot.model.chain(robot.wrist_link))
@@ -64,10 +64,10 @@ class HandHeightBounds:
                 pose = torch.tensor(pose, dtype=torch.float32)
                 self._fixed.append((spheres[0] @ pose[:3, :3].T + pose[:3, 3], spheres[1]))
         self.radii = torch.cat([radii for _, radii in self._fixed] + [radii for *_, radii in self._moving])
-        """(m,) radii [m]."""
+        """(m,) radii of the spheres [m]."""
 
     def spheres(self, joints: Float[Tensor, "c h"]) -> Float[Tensor, "c m 3"]:
-        """Centres [m] in the wrist frame at hand joints [rad]."""
+        """Centres in the wrist frame [m] at hand joints [rad], in the order of `robot.hand`."""
         parts = [centres.expand(len(joints), -1, -1) for centres, _ in self._fixed]
         for chain, index, centres, _ in self._moving:
             position, rotation = chain.tip_pose(joints[:, index])
@@ -76,7 +76,7 @@ class HandHeightBounds:
 
 
 class ArmHeightBounds:
-    """The links between the first joint and the wrist as spheres; `chain` is that from root to wrist."""
+    """The links between the first joint and the wrist as spheres; `chain` is the one from the root to the wrist."""
 
     def __init__(self, robot: RobotDescription, chain: SerialChain):
         joints = [joint for joint in robot.model.chain(robot.wrist_link) if joint.moves]
@@ -87,7 +87,17 @@ class ArmHeightBounds:
     def height(
         self, q: Float[Tensor, "*batch dof"], normal: Float[Tensor, " 3"], level: float, frames: Frames | None = None
     ) -> Float[Tensor, "*batch"]:
-        """Lowest height [m] above the plane normal . x = level of the base frame, at arm joints [rad]."""
+        """Smallest height above a plane at arm joints.
+
+        Args:
+            q: arm joints [rad].
+            normal: unit normal of the plane in the base frame.
+            level: the plane is normal . x = level [m].
+            frames: forward kinematics of `q`, if known.
+
+        Returns:
+            Heights, negative below the plane [m].
+        """
         poses = (frames or self._chain.forward(q.reshape(-1, q.shape[-1]))).joints
         lowest = [
             ((normal @ poses[:, i, :3, :3])[:, None] * centres).sum(-1) + (poses[:, i, :3, 3] @ normal)[:, None] - radii

@@ -1,14 +1,13 @@
 """Batched inverse kinematics of the arm: seeds from a table of postures, then damped least squares within limits.
 
-A turn of the first joint turns the wrist about that joint's axis and does nothing else. The table therefore holds
-postures with the first joint at zero and the wrist poses they give; a target is first turned about the axis until its
-azimuth is zero, the nearest wrist poses of the table are looked up, and the azimuth is given back to the first joint.
-From such a seed the target is a few steps of
+Rotating the first joint rotates the wrist about that joint's axis and changes nothing else. The table therefore holds
+postures with the first joint at zero, with their wrist poses. A target is rotated about the axis to azimuth zero, the
+nearest wrist poses of the table are looked up, and the first joint is set to the azimuth. From such a seed a few steps
 
     dq = J^T (J J^T + lambda^2 I)^-1 e,   lambda^2 = DAMPING_FLOOR + DAMPING_GAIN |e|^2
 
-away (Sugihara 2011, Levenberg-Marquardt with an error-dependent damping): robust far from the target and nearly
-quadratic close to it. A joint at a limit that the step would leave takes no part in that step.
+reach the target (T. Sugihara, 2011: Levenberg-Marquardt with error-dependent damping), robustly from far away and with
+nearly quadratic convergence close to it. A joint at a limit is excluded from steps that would exceed the limit.
 """
 
 from __future__ import annotations
@@ -32,59 +31,59 @@ ANGLE_TOLERANCE = 2e-3
 LIMIT_MARGIN = 0.01
 """Distance that solutions keep from the joint limits [rad]; the wrist controller keeps the same."""
 DAMPING_FLOOR = 1e-5
-"""lambda^2 at the target."""
+"""lambda^2 at the target [m^2] or [rad^2]."""
 DAMPING_GAIN = 0.02
-"""Growth of lambda^2 with the squared error (m^2 and rad^2 together)."""
+"""Ratio of lambda^2 to the squared error, metres and radians added [1]."""
 LARGEST_STEP = 0.6
 """Largest change of a joint in one iteration [rad]."""
-PULLED = 4
-"""Iterations that also pull towards the start posture in the null space."""
-PULL = 0.2
-"""Share of the way to the start posture in such an iteration."""
+NULLSPACE_ITERATIONS = 4
+"""Number of first iterations with a nullspace motion towards the start posture."""
+NULLSPACE_GAIN = 0.2
+"""Share of the way to the start posture per such iteration [1]."""
 METRES_PER_RADIAN = 0.3
-"""What a radian of orientation counts in the search for seeds [m/rad]."""
+"""Weight of orientation errors in the search for seeds [m/rad]."""
 METRES_PER_JOINT_RADIAN = 0.03
-"""What a radian of distance from the start posture counts in the search for seeds [m/rad]."""
+"""Weight of the distance from the start posture in the search for seeds [m/rad]."""
 TABLE_SIZE = 8192
-"""Postures in the table of seeds."""
+"""Number of postures in the table of seeds."""
 CHUNK = 512
-"""Targets looked up at once; bounds the memory."""
+"""Number of targets looked up at once; bounds the memory."""
 MARGIN_SCALE = 0.1
-"""Distance from a joint limit below which a solution becomes dear [rad]."""
+"""Length scale of the cost of being near a joint limit [rad]."""
 MARGIN_COST = 1.0
-"""Cost of a joint at its limit, in radians of distance from the start posture."""
+"""Cost of a joint at its limit, equivalent to a distance from the start posture [rad]."""
 MANIPULABILITY_SCALE = 0.02
-"""sqrt(det(J J^T)) below which a solution becomes dear [m^3 / rad^3]."""
+"""Scale of manipulability sqrt(det(J J^T)) in the cost of being near a singularity [m^3/rad^3]."""
 MANIPULABILITY_COST = 1.0
-"""Cost of a singular posture, in radians of distance from the start posture."""
-LAST = 1e3
-"""More than any solution's cost [rad]: puts what is not solved last."""
+"""Cost of a singular posture, equivalent to a distance from the start posture [rad]."""
+UNSOLVED_COST = 1e3
+"""Cost of a posture that is not solved; larger than any solution's, so that it is sorted last [rad]."""
 NUMBERS = {
     "position_tolerance": POSITION_TOLERANCE,
     "angle_tolerance": ANGLE_TOLERANCE,
     "limit_margin": LIMIT_MARGIN,
     "damping": (DAMPING_FLOOR, DAMPING_GAIN),
     "largest_step": LARGEST_STEP,
-    "pull": (PULLED, PULL),
+    "pull": (NULLSPACE_ITERATIONS, NULLSPACE_GAIN),
     "metres_per_radian": (METRES_PER_RADIAN, METRES_PER_JOINT_RADIAN),
     "table_size": TABLE_SIZE,
     "margin": (MARGIN_SCALE, MARGIN_COST),
     "manipulability": (MANIPULABILITY_SCALE, MANIPULABILITY_COST),
     "step_damping": DAMPING,
 }
-"""All that solutions depend on besides the robot, for digests of what is stored."""
+"""Numbers on which solutions depend besides the robot, for the digests of stored tables."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solutions:
-    """Postures for n wrist poses, s for each, solved ones first and of these the best first.
+    """s postures for each of n wrist poses: solved ones first, in ascending order of cost.
 
     Attributes:
         q: (n, s, dof) arm joints [rad], always finite and within the limits.
         position_error: (n, s) distance of the wrist from its target [m].
-        angle_error: (n, s) angle of the wrist from its target [rad].
-        solved: (n, s) both errors are within the tolerances.
-        cost: (n, s) distance from the start posture [rad] plus penalties near limits and singularities.
+        angle_error: (n, s) angle between the wrist and its target [rad].
+        solved: (n, s) whether both errors are within the tolerances.
+        cost: (n, s) distance from the start posture plus penalties near limits and singularities [rad].
     """
 
     q: Float[Tensor, "n s dof"]
@@ -98,9 +97,9 @@ class InverseKinematics:
     """Arm postures for wrist poses given in the robot's base frame.
 
     Args:
-        robot: whose chain from root to wrist is solved.
-        start: (dof,) posture [rad] that solutions should be near; the posture "home" by default.
-        seed: of the table of seeds; the same seed gives the same solutions.
+        robot: the robot whose chain from root to wrist is solved.
+        start: (dof,) posture near which solutions are preferred [rad]; the posture "home" by default.
+        seed: seed of the table of postures; the same seed gives the same solutions.
 
     Raises:
         InputError: `start` has another number of joints than the arm.
@@ -133,9 +132,16 @@ class InverseKinematics:
         seeds: int = 4,
         iterations: int = 24,
     ) -> Solutions:
-        """Postures for wrist poses (m, wxyz) in the base frame, from `seeds` starts each.
+        """Postures for wrist poses in the base frame.
 
-        A pose that is out of reach gives the posture where the iterations ended, not solved.
+        Args:
+            position: wrist positions [m].
+            quaternion: wrist orientations, wxyz.
+            seeds: s, number of seeds per pose.
+            iterations: largest number of damped steps.
+
+        Returns:
+            Solutions; for a pose out of reach those are the postures after the last iteration, not solved.
         """
         rotation = matrix_from_quaternion(quaternion)
         q = self._seeds(position, rotation, seeds)
@@ -145,7 +151,7 @@ class InverseKinematics:
         away, turn = error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1)
         solved = (away < POSITION_TOLERANCE) & (turn < ANGLE_TOLERANCE)
         cost = self._cost(q, manipulability)
-        order = torch.where(solved, cost, LAST + away + turn).reshape(n, seeds).argsort(dim=-1, stable=True)
+        order = torch.where(solved, cost, UNSOLVED_COST + away + turn).reshape(n, seeds).argsort(dim=-1, stable=True)
         flat = (order + seeds * torch.arange(n)[:, None]).reshape(-1)
         return Solutions(
             q[flat].reshape(n, seeds, dof),
@@ -159,14 +165,21 @@ class InverseKinematics:
         quaternion: Float[Tensor, "n k 4"],
         iterations: int = 4,
     ) -> tuple[Float[Tensor, "n k dof"], Bool[Tensor, "n k"]]:
-        """Tracks k wrist poses in turn, each from the posture of the one before, the first from `q`.
+        """Tracks k wrist poses one after the other, each from the posture of the one before.
 
-        Returns the postures [rad] and whether each is within the tolerances.
+        Args:
+            q: arm joints before the first pose [rad].
+            position: wrist positions in the base frame [m].
+            quaternion: wrist orientations in the base frame, wxyz.
+            iterations: largest number of damped steps per pose.
+
+        Returns:
+            Arm joints [rad], and whether each posture is within the tolerances.
         """
         rotation = matrix_from_quaternion(quaternion)
         postures, solved = [], []
         for place, turn in zip(position.unbind(1), rotation.unbind(1), strict=True):
-            q, error, _ = self._iterate(q, place, turn, iterations, pulled=0)
+            q, error, _ = self._iterate(q, place, turn, iterations, nullspace_iterations=0)
             postures.append(q)
             solved.append(
                 (error[:, :3].norm(dim=-1) < POSITION_TOLERANCE) & (error[:, 3:].norm(dim=-1) < ANGLE_TOLERANCE)
@@ -174,7 +187,7 @@ class InverseKinematics:
         return torch.stack(postures, 1), torch.stack(solved, 1)
 
     def _features(self, position: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
-        """Pose turned about the first joint's axis to azimuth zero, as a vector, and the azimuth [rad]."""
+        """Features (n, 11) of poses rotated about the first joint's axis to azimuth zero; their azimuths (n,) [rad]."""
         turn, origin = self._axis[:3, :3], self._axis[:3, 3]
         local = (position - origin) @ turn
         azimuth = torch.atan2(local[:, 1], local[:, 0])
@@ -186,7 +199,7 @@ class InverseKinematics:
         return torch.cat([radius, local[:, 2:], METRES_PER_RADIAN * 0.5**0.5 * turned.flatten(1)], -1), azimuth
 
     def _seeds(self, position: Tensor, rotation: Tensor, count: int) -> Tensor:
-        """(n, count, dof) postures of the table: the nearest of each of `count` parts of it."""
+        """(n, count, dof) seeds: the nearest posture in each of `count` parts of the table [rad]."""
         features, azimuth = self._features(position, rotation)
         rest = METRES_PER_JOINT_RADIAN * self.start[1:].expand(len(features), -1)
         queries = torch.cat([features, rest], -1)
@@ -202,9 +215,18 @@ class InverseKinematics:
         return q.clamp(self.lower, self.upper)
 
     def _iterate(
-        self, q: Tensor, position: Tensor, rotation: Tensor, iterations: int, pulled: int = PULLED
+        self,
+        q: Tensor,
+        position: Tensor,
+        rotation: Tensor,
+        iterations: int,
+        nullspace_iterations: int = NULLSPACE_ITERATIONS,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Damped steps until all rows are within half the tolerances; (q, error (n, 6), manipulability (n,))."""
+        """Damped steps until all rows are within half the tolerances.
+
+        Returns:
+            Joints (n, dof) [rad], errors (n, 6) [m], [rad], and manipulabilities (n,) [m^3/rad^3].
+        """
         out, left = q.clone(), torch.arange(len(q))
         final, manipulability = q.new_empty(len(q), 6), q.new_empty(len(q))
         for i in range(iterations + 1):
@@ -225,18 +247,18 @@ class InverseKinematics:
                     break
                 q, error, jacobian, left = q[keep], error[keep], jacobian[keep], left[keep]
                 position, rotation = position[keep], rotation[keep]
-            q = self._step(q, error, jacobian, PULL if i < pulled else 0.0)
+            q = self._step(q, error, jacobian, NULLSPACE_GAIN if i < nullspace_iterations else 0.0)
         return out, final, manipulability
 
-    def _step(self, q: Tensor, error: Tensor, jacobian: Tensor, pull: float) -> Tensor:
+    def _step(self, q: Tensor, error: Tensor, jacobian: Tensor, nullspace_gain: float) -> Tensor:
         gradient = (error.unsqueeze(-2) @ jacobian).squeeze(-2)
         stuck = ((q >= self.upper) & (gradient > 0)) | ((q <= self.lower) & (gradient < 0))
         jacobian = jacobian * ~stuck[:, None]
         damping = DAMPING_FLOOR + DAMPING_GAIN * error.square().sum(-1)
         goal = error.unsqueeze(-1)
-        rest = pull * (self.start - q)
-        rest[:, 0] = 0.0  # the azimuth decides it
-        if pull:
+        rest = nullspace_gain * (self.start - q)
+        rest[:, 0] = 0.0  # the first joint is determined by the azimuth
+        if nullspace_gain:
             goal = goal - jacobian @ rest.unsqueeze(-1)
         transposed = jacobian.transpose(1, 2)
         product = torch.baddbmm(damping[:, None, None] * self._identity, jacobian, transposed)
@@ -257,7 +279,7 @@ class InverseKinematics:
 def pose_error(
     frames: Frames, position: Float[Tensor, "n 3"], rotation: Float[Tensor, "n 3 3"]
 ) -> Float[Tensor, "n 6"]:
-    """Displacement [m] and rotation vector [rad], in the base frame, from the tip to the target."""
+    """Displacement [m] and rotation vector [rad] from the tip to the target pose, in the base frame."""
     tip = frames.tip
     turn = rotation @ tip[:, :3, :3].transpose(1, 2)
     skew = 0.5 * torch.stack(

@@ -1,4 +1,4 @@
-"""Collision-free arm motions: RRT-Connect of OMPL over the collision model, shortened, smoothed and timed."""
+"""Collision-free arm motions: RRT-Connect of OMPL on the collision model, then shortcuts, smoothing and timing."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from dora.errors import InputError
 from dora.robot.motion.collision import CollisionModel, need
 
 RESOLUTION = 0.02
-"""Distance in joint space between two postures that are checked while planning [rad]."""
+"""Distance in joint space of the postures that are tested while planning [rad]."""
 FINE_RESOLUTION = 0.005
-"""The same for the finished path [rad]."""
+"""Distance in joint space of the postures that are tested on the finished path [rad]."""
 RANGE = 0.8
-"""Longest edge that the planner adds to its trees [rad]."""
+"""Largest length of an edge that the planner adds to its trees [rad]."""
 EDGE_LIMIT = 0.05
-"""Longest distance between two way points of the returned path [rad]."""
+"""Largest distance between two way points of the returned path [rad]."""
 SMOOTHING_STEPS = 3
-"""Subdivisions of the B-spline that rounds off corners."""
+"""Number of subdivisions of the B-spline that rounds off corners."""
 
 
 @dataclass(frozen=True)
 class PlanSettings:
-    """How hard to search.
+    """Effort of the planner.
 
     Attributes:
-        checks: how often the planner may ask whether to go on; about the number of nodes it tries.
-        attempts: independent searches, each with its own seed and a finer resolution.
-        seed: the same seed gives the same path.
+        checks: number of calls of the termination condition after which a search ends; about the number of nodes.
+        attempts: number of searches, each with its own seed and half the resolution of the one before.
+        seed: seed of the first search; the same seed gives the same path.
     """
 
     checks: int = 400
@@ -45,20 +45,20 @@ def plan(
     hand: Float[np.ndarray, " h"],
     settings: PlanSettings | None = None,
 ) -> Float[np.ndarray, "k dof"] | None:
-    """A path of arm postures [rad] from `start` to `goal` on which nothing touches.
+    """A collision-free path of arm postures from `start` to `goal`.
 
-    The straight line in joint space is taken where it is free, so most paths cost no search.
+    The straight line in joint space is taken where it is free, so most paths need no search.
 
     Args:
-        model: what must not touch; its object is where `place_object` put it.
+        model: collision model, with the object at the pose of its last `place_object`.
         start: arm joints [rad].
         goal: arm joints [rad].
-        hand: hand joints [rad], held during the motion.
+        hand: hand joints, constant during the motion [rad].
         settings: effort and seed.
 
     Returns:
-        k way points at most EDGE_LIMIT apart, within the joint limits and free at FINE_RESOLUTION; None if there is
-        none, in particular where `start` or `goal` touch something.
+        k way points [rad], at most `EDGE_LIMIT` apart, within the joint limits and free at `FINE_RESOLUTION`; None if
+        no path was found or `start` or `goal` is in collision.
 
     Raises:
         InputError: OMPL is not installed, or `start` or `goal` is outside the joint limits.
@@ -83,7 +83,7 @@ def plan(
 
 
 def densified(path: Float[np.ndarray, "k dof"], spacing: float) -> Float[np.ndarray, "m dof"]:
-    """The same polygon with points at most `spacing` apart (Euclidean, in the path's unit)."""
+    """The same polyline with points at most `spacing` apart (Euclidean distance, in the path's unit)."""
     counts = np.maximum(1, np.ceil(np.linalg.norm(np.diff(path, axis=0), axis=1) / spacing)).astype(int)
     pieces = [a + (b - a) * np.arange(n)[:, None] / n for a, b, n in zip(path[:-1], path[1:], counts, strict=True)]
     return np.concatenate([*pieces, path[-1:]])
@@ -95,19 +95,19 @@ def timed(
     period: float,
     ramp: float = 0.3,
 ) -> Float[np.ndarray, "m dof"]:
-    """Postures at multiples of `period` [s] along a path, from rest to rest.
+    """Postures along a path in steps of `period`, from rest to rest.
 
-    At full speed the joint that is slowest on an edge moves at its limit; speed rises to that linearly in `ramp`
-    seconds, and falls likewise at the end.
+    At full speed one joint moves at its velocity limit on each edge. The speed rises linearly during `ramp` and falls
+    likewise at the end.
 
     Args:
         path: way points [rad].
-        velocity: limits [rad/s], more than 0.
-        period: of the control steps [s].
+        velocity: velocity limits of the joints, above 0 [rad/s].
+        period: control period [s].
         ramp: time from rest to full speed [s].
 
     Returns:
-        m postures [rad], the first and last of the path included; no step exceeds velocity * period.
+        m postures [rad], from the first to the last of the path; no step exceeds velocity * period.
     """
     edges = (np.abs(np.diff(path, axis=0)) / velocity).max(1)
     clock = np.concatenate([[0.0], np.cumsum(edges)])
@@ -131,7 +131,7 @@ def _search(
     """One run of RRT-Connect with shortening and smoothing; None if it finds nothing."""
     base, geometric, util = need("ompl.base", "ompl"), need("ompl.geometric", "ompl"), need("ompl.util", "ompl")
     util.setLogLevel(util.LOG_NONE)
-    util.RNG.setSeed(seed + 1)  # 0 would draw a random one
+    util.RNG.setSeed(seed + 1)  # OMPL draws a random seed for 0
     arm, dof = model.robot.arm, len(start)
     space = base.RealVectorStateSpace(dof)
     bounds = base.RealVectorBounds(dof)

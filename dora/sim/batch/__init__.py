@@ -1,1 +1,1 @@
-"""Batched CPU physics: ManiSkill's GPU interface served from one `PhysxCpuSystem` per environment."""
+"""Batched CPU physics: ManiSkill's GPU interface, implemented by one `PhysxCpuSystem` per environment."""

@@ -1,4 +1,4 @@
-"""Refuses actions that make no sense before anything in the simulator is touched."""
+"""Checks of actions before they reach the simulator: shape, robots' names, finite numbers."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,7 +19,7 @@ def check_action(env: Any, action: Any) -> None:
             with ``control_mode`` and ``action``. One environment may leave the batch axis out.
 
     Raises:
-        InputError: if a shape or a robot's name does not fit or a number is not finite.
+        InputError: a shape or a robot's name does not fit, or a number is not finite.
     """
     if isinstance(action, Mapping) and "control_mode" in action:
         if action["control_mode"] == env.agent.control_mode:

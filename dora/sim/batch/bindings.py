@@ -1,4 +1,4 @@
-"""Connects each table of a batch system to SAPIEN's getters and setters."""
+"""Bindings of the tables of a batch system to SAPIEN's getters and setters."""
 
 from __future__ import annotations
 
@@ -18,21 +18,27 @@ if TYPE_CHECKING:
     from dora.sim.batch.system import BatchSystem
 
 POSE = slice(0, POSE_FLOATS)
+"""Columns of a body's row with its pose."""
 LINEAR = slice(POSE_FLOATS, POSE_FLOATS + 3)
+"""Columns of a body's row with its linear velocity."""
 ANGULAR = slice(POSE_FLOATS + 3, BODY_COLUMNS)
+"""Columns of a body's row with its angular velocity."""
 _AXES = 3
+"""Number of components of a vector."""
 _SPATIAL_FORCE = 6
-"""Components of an incoming joint force: force [N] and torque [N m]."""
+"""Number of components of an incoming joint force: force [N] and torque [N m]."""
 
 Located = tuple[Source, np.ndarray]
+"""A source of values and indices into its flat array."""
 Setter = Callable[[np.ndarray], None]
+"""Function that sets one quantity of one body."""
 
 
 def make_tables(system: BatchSystem) -> dict[str, Table]:
-    """All tables of a system by the names that `PhysxGpuSystem` gives them.
+    """All tables of a system by their names in `PhysxGpuSystem`.
 
-    Rows of ``cuda_rigid_body_*`` are bodies, all others articulations; columns beyond an articulation's
-    degrees of freedom read as 0 and ignore writes. Forces and torques act in the next physics step and
+    Rows of ``cuda_rigid_body_*`` are bodies, those of all other tables articulations; columns beyond an articulation's
+    degrees of freedom read as 0 and ignore writes. Forces [N] and torques [N m] act in the next physics step and
     cannot be read.
     """
     links = (len(system.layout.articulations), system.layout.max_links, _SPATIAL_FORCE)
@@ -77,7 +83,7 @@ def _body_table(system: BatchSystem) -> Table:
 
 
 def _plan_bodies(system: BatchSystem, elements: np.ndarray) -> list[Part]:
-    """Poses and actors' velocities come from the packed state, links' velocities from their getters."""
+    """The parts of a read: poses and velocities of actors from the packed state, velocities of links from getters."""
     is_pose = elements % BODY_COLUMNS < POSE_FLOATS
     is_link = elements // BODY_COLUMNS >= system.layout.actor_rows
     choices = (
@@ -117,7 +123,7 @@ def _locate_link_velocities(system: BatchSystem, elements: np.ndarray) -> Locate
 
 
 def _pose_setter(row: BodyRow) -> Setter:
-    """A link's pose is set through the link, as ManiSkill does: for a root it moves the articulation."""
+    """Setter of a pose; that of a link, as in ManiSkill, moves the articulation if the link is its root."""
     return partial(_set_pose, row.body.set_entity_pose if row.is_link else row.entity.set_pose)
 
 
@@ -126,7 +132,7 @@ def _set_pose(setter: Callable[[sapien.Pose], None], pose: Any) -> None:
 
 
 def _velocity_setter(row: BodyRow, kind: str) -> Setter | None:
-    """Setter of a velocity; None for kinematic bodies and links other than roots, which have none of their own."""
+    """Setter of a velocity; None for kinematic bodies and for links other than roots, which have no such state."""
     if not row.is_link:
         return None if row.body.kinematic else getattr(row.body, f"set_{kind}_velocity")
     return getattr(row.body.articulation, f"set_root_{kind}_velocity") if row.body.is_root else None
@@ -205,7 +211,7 @@ def _state_planner(system: BatchSystem, quantity: str) -> Callable[[np.ndarray],
 def _getter_planner(
     system: BatchSystem, getter: Callable[[Articulation], np.ndarray], row_shape: tuple[int, ...]
 ) -> Callable[[np.ndarray], Sequence[Part]]:
-    """Plan for a quantity that has a getter per articulation, whose result may be shorter than a row."""
+    """Planner for a quantity with one getter per articulation, whose result may be shorter than a row."""
     rows = system.layout.articulations
     lengths = [getter(row.articulation).size for row in rows]
     width = int(np.prod(row_shape))

@@ -1,6 +1,6 @@
-"""What has to change in ManiSkill so that it accepts the back end: a handful of functions, wrapped once.
+"""The functions of ManiSkill that are wrapped so that it accepts the back end ``physx_cpu_batch``.
 
-Every wrapper passes on to ManiSkill's own code unless the environment at hand runs on ``physx_cpu_batch``.
+Every wrapper calls ManiSkill's own code unless the environment runs on that back end.
 """
 
 from collections.abc import Callable
@@ -27,8 +27,9 @@ from dora.sim.batch.rendering import can_render, replace_materials
 from dora.sim.batch.scene import BatchScene
 
 BACKEND = "physx_cpu_batch"
+"""Name of the back end as `sim_backend`."""
 SUPPORTED = {"mani_skill": "3.0.1", "sapien": "3.0.3"}
-"""Versions whose internals the wrappers fit."""
+"""Versions for which the wrappers are written, by package."""
 STATE_MODES = ("state", "state_dict", "none")
 """Observation modes that need no renderer."""
 
@@ -36,10 +37,10 @@ _installed = False
 
 
 def install() -> None:
-    """Make ``sim_backend="physx_cpu_batch"`` known to ManiSkill. Calling it again does nothing.
+    """Make ``sim_backend="physx_cpu_batch"`` known to ManiSkill; further calls do nothing.
 
     Raises:
-        InputError: if another version of ManiSkill or SAPIEN is installed than those in ``SUPPORTED``.
+        InputError: ManiSkill or SAPIEN is installed in another version than in ``SUPPORTED``.
     """
     global _installed
     if _installed:
@@ -80,7 +81,7 @@ def runs_batched(env: Any) -> bool:
 
 def _parse_backends(original: Callable) -> Callable:
     def parse(sim_backend: str, render_backend: str | None) -> BackendInfo:
-        """Stock's answer, or that for a CPU under our name."""
+        """ManiSkill's result, or its result for a CPU with the name of this back end."""
         if sim_backend != BACKEND:
             return original(sim_backend, render_backend)
         info = original("physx_cpu", render_backend or "none")
@@ -107,7 +108,7 @@ def _init(original: Callable) -> Callable:
 
 def _setup_scene(original: Callable) -> Callable:
     def setup_scene(self: BaseEnv) -> None:
-        """Stock's scene, or a `BatchScene`; InputError if pictures are asked for and there is no driver."""
+        """ManiSkill's scene, or a `BatchScene`; InputError if pictures are needed and there is no driver."""
         if not runs_batched(self):
             return original(self)
         renderers = [] if self._render_device is None else [self._render_device]
@@ -131,7 +132,7 @@ def _setup_scene(original: Callable) -> Callable:
 
 def _step_action(original: Callable) -> Callable:
     def step_action(self: BaseEnv, action: Any) -> Any:
-        """Checks the action, then lets the control step's physics wait for one pass per environment."""
+        """Checks the action, then defers the physics steps of the control step to one pass per environment."""
         if not runs_batched(self):
             return original(self, action)
         check_action(self, action)
@@ -148,7 +149,7 @@ def _step_action(original: Callable) -> Callable:
 
 
 def _is_overridden(env: BaseEnv, method: str) -> bool:
-    """Whether a method of BaseEnv was replaced, in the task's class or in this very object."""
+    """Whether a method of BaseEnv is overridden, in the task's class or in the instance."""
     return getattr(getattr(env, method), "__func__", None) is not getattr(BaseEnv, method)
 
 
@@ -156,10 +157,10 @@ def _is_overridden(env: BaseEnv, method: str) -> bool:
 
 
 def _get_meshes(original: Callable) -> Callable:
-    """Tell ManiSkill that poses can be read, which it doubts until a GPU was initialised."""
+    """Lets ManiSkill read poses before its flag for an initialised GPU is set."""
 
     def get_meshes(self: Articulation, *args: Any, **kwargs: Any) -> Any:
-        """Stock's meshes, while the scene says that it has been initialised."""
+        """ManiSkill's meshes, with the flag set for the duration of the call."""
         if not isinstance(self.scene, BatchScene):
             return original(self, *args, **kwargs)
         self.scene._gpu_sim_initialized = True
@@ -172,14 +173,14 @@ def _get_meshes(original: Callable) -> Callable:
 
 
 def _set_pose_action(original: Callable) -> Callable:
-    """Aim the inverse kinematics at target poses, as on a CPU; on a GPU ManiSkill hands it the deltas.
+    """Gives target poses to the inverse kinematics, as on a CPU; on a GPU ManiSkill gives it the deltas.
 
-    A controller with ``use_target`` does so everywhere, starting from its last target; here the start is the
-    measured pose.
+    A controller with ``use_target`` does so on every back end, relative to its last target; without it the target is
+    relative to the measured pose.
     """
 
     def set_action(self: PDEEPosController, action: Any) -> None:
-        """Stock's action relative to the measured pose, as on a single CPU."""
+        """ManiSkill's action relative to the measured pose, as on a single CPU."""
         if not isinstance(self.scene, BatchScene) or self.config.use_target:
             return original(self, action)
         self._target_pose = self.ee_pose_at_base
@@ -193,7 +194,7 @@ def _set_pose_action(original: Callable) -> Callable:
 
 
 def _compute_ik(original: Callable) -> Callable:
-    """Pinocchio's inverse kinematics, one environment after the other; where it fails the joints stay."""
+    """Pinocchio's inverse kinematics, one environment after the other; where it fails the joints stay unchanged."""
 
     def compute_ik(self: Kinematics, pose: Any, q0: torch.Tensor, *args: Any, **kwargs: Any) -> Any:
         if not isinstance(self.articulation.scene, BatchScene):

@@ -1,4 +1,4 @@
-"""Which rows of the tables belong to which bodies, and where their values lie in the packed state."""
+"""Layout of the tables: the rows of bodies and articulations, and the indices of their values in the packed state."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from sapien import physx
 from dora.sim.batch.packed import POSE_FLOATS, POSE_ORDER, RIGID_FLOATS, PackedSource
 
 BODY_COLUMNS = 13
-"""Columns of a body's row: position [m], quaternion wxyz, linear [m/s] and angular [rad/s] velocity; world frame."""
+"""Number of columns of a body: position [m], quaternion wxyz, linear [m/s], angular velocity [rad/s]; world frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodyRow:
-    """One rigid body: an actor's (``link`` is None) or an articulation's link."""
+    """One rigid body of one environment: that of an actor or a link of an articulation."""
 
     environment: int
     entity: sapien.Entity
@@ -35,10 +35,10 @@ class ArticulationRow:
 
 
 class Layout:
-    """Numbers all bodies and articulations of a scene.
+    """The rows of all bodies and articulations of a scene.
 
-    Bodies of one ManiSkill struct have consecutive rows: first actors, then links. ``row_of`` and
-    ``articulation_of`` find the row of a sapien object by its identity (the structs keep the objects alive).
+    Bodies of one ManiSkill struct have consecutive rows, first those of actors, then those of links. ``row_of`` and
+    ``articulation_of`` give the row of a SAPIEN object by its ``id`` (the structs keep the objects alive).
     """
 
     def __init__(self, actors: Mapping[str, Any], articulations: Mapping[str, Any]):
@@ -66,7 +66,7 @@ class Layout:
 
 
 def pose_index(layout: Layout, scenes: list[sapien.Scene], poses: PackedSource) -> np.ndarray:
-    """Index into ``poses.flat()`` of each body's position and quaternion, shape (bodies, 7)."""
+    """(bodies, 7) indices into ``poses.flat()`` of each body's position and quaternion."""
     position = [{id(entity): i for i, entity in enumerate(scene.entities)} for scene in scenes]
     starts = poses.starts()
     first = [starts[row.environment] + POSE_FLOATS * position[row.environment][id(row.entity)] for row in layout.bodies]
@@ -75,7 +75,7 @@ def pose_index(layout: Layout, scenes: list[sapien.Scene], poses: PackedSource) 
 
 @dataclass(frozen=True, eq=False)
 class StateIndex:
-    """Index into ``state.flat()``; entries without a value point at its padding zero.
+    """Indices into ``state.flat()``; entries without a value refer to the zero at its end.
 
     ``velocity`` (actor bodies, 6); ``qpos``, ``qvel``, ``target_qpos``, ``target_qvel`` (articulations, max dof).
     """
@@ -88,7 +88,7 @@ class StateIndex:
 
 
 def state_index(layout: Layout, systems: list[physx.PhysxCpuSystem], state: PackedSource) -> StateIndex:
-    """Find every value of the bodies and articulations in what `PhysxCpuSystem.pack` returns."""
+    """Indices of the values of all bodies and articulations in the result of `PhysxCpuSystem.pack`."""
     starts, padding = state.starts(), state.padding
     velocity = np.full((layout.actor_rows, 6), padding, np.int64)
     joint = np.full((4, len(layout.articulations), layout.max_dof), padding, np.int64)
@@ -118,12 +118,13 @@ def check_packing(layout: Layout, poses: np.ndarray, state: np.ndarray, index: S
     """Compare packed values with those of the getters.
 
     Args:
-        poses: (bodies, 7) position and quaternion read from the packed poses.
+        layout: the rows of the tables.
+        poses: (bodies, 7) position [m] and quaternion read from the packed poses.
         state: the packed state, flat.
-        index: where the values are in ``state``.
+        index: indices of the values in ``state``.
 
     Raises:
-        RuntimeError: if this SAPIEN packs its state in another order than the one known here.
+        RuntimeError: the installed SAPIEN packs its state in an unknown order.
     """
     for row, pose in zip(layout.bodies, poses, strict=True):
         now = row.entity.pose

@@ -1,8 +1,8 @@
-"""Simulator state of many environments as flat float32 arrays, re-read only where it went stale.
+"""Simulator state of many environments as flat float32 arrays, read again only where it is out of date.
 
-SAPIEN packs a whole scene into bytes in one C++ call: `Scene.pack_poses` gives the poses of all entities and
+SAPIEN packs a whole scene into bytes in one C++ call: `Scene.pack_poses` returns the poses of all entities,
 `PhysxCpuSystem.pack` the state of all bodies and articulations. One such call replaces dozens of getters,
-returns exact copies of the simulator's numbers and changes nothing in it.
+returns exact copies of the simulator's numbers and changes nothing.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -11,19 +11,21 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 POSE_FLOATS = 7
-"""Packed pose: quaternion wxyz, then position [m]."""
+"""Number of floats of a packed pose: quaternion wxyz, then position [m]."""
 RIGID_FLOATS = 13
-"""Packed rigid body or articulation root: pose, linear velocity [m/s], angular velocity [rad/s]."""
+"""Number of floats of a packed body or articulation root: pose, linear [m/s] and angular velocity [rad/s]."""
 POSE_ORDER = np.array([4, 5, 6, 0, 1, 2, 3])
-"""Where position and quaternion (ManiSkill's order) lie in a packed pose."""
+"""Indices of position and quaternion, in ManiSkill's order, in a packed pose."""
 
 _FLOAT_BYTES = 4
+"""Size of a float32 in bytes."""
 _ZERO = bytes(_FLOAT_BYTES)
+"""A float32 zero as bytes."""
 
 
 @runtime_checkable
 class Source(Protocol):
-    """Anything that has up-to-date simulator values as one flat array."""
+    """A provider of current simulator values as one flat array."""
 
     def flat(self) -> np.ndarray:
         """Current values, float32, read-only."""
@@ -31,10 +33,10 @@ class Source(Protocol):
 
 
 class PackedSource:
-    """The packed bytes of all environments, concatenated, with one zero at the end for padding.
+    """The packed state of all environments in one array, with a zero at the end for padding.
 
-    ``readers[i]()`` returns the bytes of environment i. `refresh` calls those that were invalidated and not
-    read since; between two calls of it the values do not change.
+    ``readers[i]()`` returns the bytes of environment i. `refresh` calls the readers of environments that were
+    invalidated and not read since; between two calls of it the values do not change.
     """
 
     def __init__(self, readers: Sequence[Callable[[], bytes]]):
@@ -58,7 +60,7 @@ class PackedSource:
         self._stale.discard(environment)
 
     def refresh(self) -> bool:
-        """Read what is out of date and show the new values; True if their number changed."""
+        """Read what is out of date and make it current; returns True if the number of values changed."""
         for environment in tuple(self._stale):
             self.read(environment)
         size = self._flat.size
@@ -66,11 +68,11 @@ class PackedSource:
         return self._flat.size != size
 
     def flat(self) -> np.ndarray:
-        """Values of all environments, float32, read-only; the last element is 0."""
+        """Values of all environments as of the last `refresh`, float32, read-only; the last element is 0."""
         return self._flat
 
     def starts(self) -> np.ndarray:
-        """Index of the first float of each environment in `flat`, shape (environments,)."""
+        """(environments,) index of the first float of each environment in `flat`."""
         sizes = [len(chunk) // _FLOAT_BYTES for chunk in self._chunks]
         return np.cumsum([0, *sizes[:-1]])
 
@@ -81,9 +83,9 @@ class PackedSource:
 
 
 class GetterSource:
-    """Values that no packed state has, read by one getter each; kept until ``epoch()`` changes.
+    """Values that are not in the packed state, read by one getter each and kept until ``epoch()`` changes.
 
-    ``flat`` is the concatenation of the getters' flattened results followed by one zero.
+    ``flat`` returns the getters' flattened results, concatenated, and one zero.
     """
 
     def __init__(self, getters: Sequence[Callable[[], np.ndarray]], epoch: Callable[[], int]):

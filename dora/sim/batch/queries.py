@@ -1,4 +1,4 @@
-"""Contact impulse queries with the interface of SAPIEN's GPU queries, answered from CPU contact lists."""
+"""Contact impulse queries with the interface of SAPIEN's GPU queries, evaluated on CPU contact lists."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,10 +7,11 @@ import numpy as np
 import torch
 
 BodyPair = tuple[Any, Any]
+"""Two SAPIEN bodies of one environment."""
 
 
 class _Impulses:
-    """Result of a query; ``torch()`` is a float32 tensor (rows, 3) in N s, as of the last time it was asked."""
+    """Result (rows, 3) of a query as of its last evaluation, with the interface of a `sapien.CudaArray`."""
 
     def __init__(self, rows: int):
         self._values = torch.zeros(rows, 3)
@@ -20,12 +21,12 @@ class _Impulses:
         self._values = torch.from_numpy(values.astype(np.float32))
 
     def torch(self) -> torch.Tensor:
-        """Impulses [N s], world frame, shape (rows, 3)."""
+        """(rows, 3) impulses in the world frame [N s], float32."""
         return self._values
 
 
 class PairImpulses:
-    """Impulse on the first body of each pair by the second, in the last physics step."""
+    """Query of the impulse on the first body of each pair by the second, in the last physics step [N s]."""
 
     def __init__(self, slots: Sequence[int], signs: Sequence[float]):
         self.slots = np.array(slots, np.int64)
@@ -34,18 +35,18 @@ class PairImpulses:
 
 
 class BodyImpulses(PairImpulses):
-    """Net impulse on each body by all others, in the last physics step."""
+    """Query of the net impulse on each body by all others, in the last physics step [N s]."""
 
     def __init__(self, slots: Sequence[int]):
         super().__init__(slots, [1.0] * len(slots))
 
 
 class ContactScanner:
-    """Looks at the contacts of every environment at most once per physics step, and only if somebody asks.
+    """Scans the contacts of every environment at most once per physics step, and only on demand.
 
-    If the contacts of the last step were asked for, those of the next are scanned right after it,
-    environment by environment. No contact is kept: SAPIEN frees them in the next step. Subclasses say what
-    to `clear` and what to `take` from a contact.
+    If the contacts of the last step were asked for, those of the next step are scanned right after it,
+    environment by environment. Contact objects are not kept, because SAPIEN frees them in the next step. Subclasses
+    implement `clear` and `take`.
     """
 
     def __init__(self, readers: Sequence[Callable[[], list]]):
@@ -54,15 +55,15 @@ class ContactScanner:
         self._asked = False
 
     def clear(self) -> None:
-        """Forget what was taken."""
+        """Drop the results of earlier scans."""
         raise NotImplementedError
 
     def take(self, environment: int, contacts: list) -> None:
-        """Take what matters from the contacts of an environment."""
+        """Process the contacts of one environment."""
         raise NotImplementedError
 
     def begin_step(self) -> bool:
-        """Forget the contacts; True if those of the coming step shall be scanned at once."""
+        """Drop the results before a physics step; returns True if its contacts are to be scanned right after it."""
         self._scanned, self._asked = self._asked, False
         self.clear()
         return self._scanned
@@ -72,7 +73,7 @@ class ContactScanner:
         self.take(environment, self._readers[environment]())
 
     def scan_missing(self) -> None:
-        """Scan all environments unless that was done since the last step."""
+        """Scan all environments unless they were scanned since the last step."""
         self._asked = True
         if not self._scanned:
             self.clear()
@@ -82,10 +83,10 @@ class ContactScanner:
 
 
 class ContactImpulses(ContactScanner):
-    """Impulses between pairs and on bodies that somebody asked for.
+    """Impulses between the pairs and on the bodies of all queries.
 
-    The sums are made in the order and precision of ManiSkill's single CPU environment (points in float32,
-    contacts in float64), so that the results are equal bit for bit.
+    Sums have the order and precision of ManiSkill's single CPU environment (points in float32, contacts in
+    float64), so that the results are equal bit for bit.
     """
 
     def __init__(self, readers: Sequence[Callable[[], list]]):
@@ -96,7 +97,7 @@ class ContactImpulses(ContactScanner):
         self._impulses = np.zeros((0, 3))
 
     def pairs(self, pairs: Sequence[BodyPair]) -> PairImpulses:
-        """A query for pairs of bodies (of the same environment each)."""
+        """A query for pairs of bodies, each pair of one environment."""
         found = [self._pair_slot(first, second) for first, second in pairs]
         return PairImpulses([slot for slot, _ in found], [sign for _, sign in found])
 
@@ -105,15 +106,15 @@ class ContactImpulses(ContactScanner):
         return BodyImpulses([self._body_slot(body) for body in bodies])
 
     def answer(self, query: PairImpulses) -> None:
-        """Fill in the query's result, after `scan_missing`."""
-        query.cuda_impulses.set(self._impulses[query.slots] * query.signs + 0.0)  # + 0: no negative zeros
+        """Write the result of a query, after `scan_missing`."""
+        query.cuda_impulses.set(self._impulses[query.slots] * query.signs + 0.0)  # + 0 avoids negative zeros
 
     def clear(self) -> None:
         """Set all impulses to zero."""
         self._impulses[:] = 0.0
 
     def take(self, environment: int, contacts: list) -> None:
-        """Add up the impulses of the contacts that a query is about."""
+        """Sum up the impulses of those contacts that belong to a query."""
         pairs, bodies = self._pairs, self._bodies
         for contact in contacts:
             first, second = contact.bodies

@@ -1,4 +1,4 @@
-"""A ManiSkill scene of N environments on the CPU, and pictures of them."""
+"""A ManiSkill scene of N environments on the CPU, and its cameras."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,13 +14,13 @@ from dora.sim.batch.system import BatchSystem
 
 
 class _Picture:
-    """A stack of pictures with the interface of a `sapien.CudaArray`."""
+    """A batch of pictures with the interface of a `sapien.CudaArray`."""
 
     def __init__(self, pixels: np.ndarray):
         self._pixels = pixels
 
     def torch(self) -> torch.Tensor:
-        """Pixels, shape (cameras, height, width, channels)."""
+        """(cameras, height, width, channels) pixels."""
         return torch.from_numpy(self._pixels)
 
 
@@ -43,9 +43,9 @@ class CameraGroup:
 class BatchScene(ManiSkillScene):
     """ManiSkill's scene with one CPU sub-scene per environment and a `BatchSystem` for its physics.
 
-    ``gpu_sim_enabled`` is true, because it selects the code of ManiSkill that handles many environments.
-    ``rendered_environments`` chooses those that `render` shows (all by default): pictures are the costly
-    part on a CPU. Cameras that make observations always render all environments.
+    ``gpu_sim_enabled`` is true, because it selects ManiSkill's code for many environments.
+    ``rendered_environments`` are the environments that `render` shows (all by default), because pictures are
+    expensive on a CPU. Cameras for observations always render all environments.
     """
 
     px: BatchSystem
@@ -64,15 +64,15 @@ class BatchScene(ManiSkillScene):
         return super().create_actor_builder().set_allow_overlapping_plane_collisions(True)
 
     def _setup(self, enable_gpu: bool) -> None:
-        """Number all bodies, then place them as a scene on a CPU does."""
+        """Builds the tables of all bodies, then places them as a scene on a CPU does."""
         self.px.build(self.actors, self.articulations)
         super()._setup(enable_gpu=False)
 
     def _gpu_apply_all(self) -> None:
-        """Nothing: all writes are in the simulator already."""
+        """Does nothing: writes go to the simulator directly."""
 
     def _gpu_fetch_all(self) -> None:
-        """Nothing: values are read when they are asked for."""
+        """Does nothing: values are read on demand."""
 
     # ---- rendering -------------------------------------------------------------------------------
 
@@ -86,11 +86,11 @@ class BatchScene(ManiSkillScene):
             self.px.invalidate()
 
     def update_render(self, update_sensors: bool = True, update_human_render_cameras: bool = True) -> None:
-        """Bring the renderers of the environments that are needed up to date.
+        """Update the renderers of the environments that are needed.
 
         Args:
-            update_sensors: pictures for observations are wanted, so all environments are needed.
-            update_human_render_cameras: pictures for people are wanted, of ``rendered_environments``.
+            update_sensors: whether to update cameras for observations, in all environments.
+            update_human_render_cameras: whether to update cameras for people, in ``rendered_environments``.
         """
         self.px.sync_poses_gpu_to_cpu()
         everyone = range(len(self.sub_scenes))

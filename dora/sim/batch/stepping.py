@@ -1,4 +1,4 @@
-"""Writes, steps and reads the environments, one after the other."""
+"""Order of writes, physics steps and reads: one environment after the other within a control step."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -12,10 +12,11 @@ from dora.sim.batch.profile import StepProfile
 from dora.sim.batch.queries import ContactImpulses, ContactScanner
 
 Setters = Sequence[Callable[[float], None]]
+"""Functions that set one value each."""
 
 
 class TargetQueue:
-    """Drive targets that wait for the next physics step of their environment."""
+    """Queue of drive targets that are set before the next physics step of their environment."""
 
     def __init__(self, environments: int):
         self._edges = np.arange(environments + 1)
@@ -25,33 +26,32 @@ class TargetQueue:
         return len(self._batches)
 
     def add(self, setters: Setters, numbers: np.ndarray, values: np.ndarray, environments: np.ndarray) -> None:
-        """Let ``setters[numbers[k]](values[k])`` wait for environment ``environments[k]``."""
+        """Queue the calls ``setters[numbers[k]](values[k])`` for the environments ``environments[k]``."""
         order = np.argsort(environments, kind="stable")
         edges = np.searchsorted(environments[order], self._edges)
         self._batches.append((setters, numbers[order].tolist(), values[order].tolist(), edges.tolist()))
 
     def write(self, environment: int) -> None:
-        """Set what waits for one environment, in the order in which it came."""
+        """Make the queued calls of one environment, in the order of their addition."""
         for setters, numbers, values, edges in self._batches:
             part = slice(edges[environment], edges[environment + 1])
             for number, value in zip(numbers[part], values[part], strict=True):
                 setters[number](value)
 
     def clear(self) -> None:
-        """Forget everything, after all environments were written."""
+        """Empty the queue, after all environments were written."""
         self._batches.clear()
 
 
 class Stepper:
-    """Keeps the simulators of all environments and what was read of them in step.
+    """Steps the simulators of all environments and keeps the values read from them current.
 
-    The processor's caches hold one environment but not all of them, so everything that has to be done with an
-    environment in a control step is done at one go: its drive targets are set, all its physics steps made,
-    its state and its contacts read; then comes the next. To that end `defer` lets writes and steps wait.
-    Environments do not interact, so results do not depend on this order.
+    The processor's caches hold one environment but not all of them. All work on an environment in a control step is
+    therefore done at once: its drive targets are set, all its physics steps are made, its state and contacts are
+    read; then the next environment follows. `defer` delays writes and steps to that end. Environments do not
+    interact, so results do not depend on this order.
 
-    Each of `watchers` is called with the number of an environment after every physics step that this environment has
-    made, before its next one.
+    Each of `watchers` is called with the index of an environment after each of its physics steps.
     """
 
     def __init__(self, scenes: Sequence[sapien.Scene]):
@@ -72,14 +72,14 @@ class Stepper:
         self._limit = 0
 
     def epoch(self) -> int:
-        """A number that changes whenever anything may have changed in the simulators."""
+        """A counter that changes whenever the state of a simulator may have changed."""
         return self._epoch
 
     def defer(self, steps: int) -> None:
-        """Let drive targets and up to ``steps`` physics steps wait until a value is read or set otherwise.
+        """Defer drive targets and up to ``steps`` physics steps until a value is read or set in another way.
 
-        While they wait, sapien objects must not be used directly. ``defer(0)``, the initial setting, makes
-        up for all that waits and lets nothing wait.
+        While steps are pending, SAPIEN objects must not be used directly. ``defer(0)``, the initial setting, executes
+        everything pending and defers nothing.
         """
         self._limit = steps
         if not steps:
@@ -96,7 +96,7 @@ class Stepper:
             self.flush()
 
     def flush(self) -> None:
-        """Do all that waits."""
+        """Execute all pending writes and steps."""
         if not self._waiting and not self._targets:
             return
         steps, self._waiting = range(self._waiting), 0
@@ -133,7 +133,7 @@ class Stepper:
                 profile.add("contacts")
 
     def refresh(self) -> None:
-        """Do all that waits and read what is out of date."""
+        """Execute all pending writes and steps, and read what is out of date."""
         if not self._stale:
             return
         self.flush()
@@ -147,7 +147,7 @@ class Stepper:
             self.resized()
 
     def refresh_targets(self) -> None:
-        """`refresh` for drive targets. Writing targets leaves all other values of the packed state as they were."""
+        """`refresh` for drive targets, whose writing changes no other value of the packed state."""
         if self._targets_stale:
             self.flush()
             self.state.invalidate_all()
@@ -155,7 +155,7 @@ class Stepper:
         self.refresh()
 
     def scan_contacts(self, scanner: ContactScanner) -> None:
-        """Do all that waits and scan the contacts, unless that was done since the last physics step."""
+        """Execute all pending steps and scan the contacts, unless they were scanned since the last physics step."""
         self.flush()
         if self.profile:
             self.profile.mark()
@@ -164,7 +164,7 @@ class Stepper:
             self.profile.add("contacts")
 
     def changed(self, environments: Iterable[int]) -> None:
-        """Declare everything read of some environments out of date."""
+        """Declare all values of some environments out of date."""
         self._epoch += 1
         self._stale = True
         self.poses.invalidate(environments)
@@ -179,7 +179,7 @@ class Stepper:
 
     @contextmanager
     def writing(self, environments: Sequence[int]) -> Iterator[None]:
-        """Around a direct change of some environments: does what waits before, and declares them changed after."""
+        """Context for direct changes of environments: executes pending steps before, declares them changed after."""
         self.flush()
         if self.profile:
             self.profile.mark()

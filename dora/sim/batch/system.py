@@ -1,4 +1,4 @@
-"""N `PhysxCpuSystem`s behind the interface of one `PhysxGpuSystem`."""
+"""The batched physics system: N `PhysxCpuSystem`s behind the interface of one `PhysxGpuSystem`."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,12 +19,12 @@ from dora.sim.batch.table import Table
 class BatchSystem:
     """The physics of N environments, each in its own `PhysxCpuSystem`.
 
-    It has the part of `PhysxGpuSystem`'s interface that ManiSkill uses, with other means: a table is read
-    when it is indexed (`Table`), and a value written to it is in the simulator at once, through the same
-    call that ManiSkill makes for a single environment on a CPU, in the same order. Hence the results are
-    the same bit for bit, and all ``gpu_fetch_*`` and ``gpu_apply_*`` have nothing left to do.
+    It implements the part of `PhysxGpuSystem`'s interface that ManiSkill uses. A table is read when it is indexed
+    (`Table`), and a value written to it goes to the simulator directly, by the call that ManiSkill makes for a single
+    environment on a CPU, in the same order. The results are therefore the same bit for bit, and all ``gpu_fetch_*``
+    and ``gpu_apply_*`` do nothing.
 
-    Within a control step, drive targets and physics steps wait for each other: see `Stepper`.
+    Within a control step, drive targets and physics steps are deferred: see `Stepper`.
     """
 
     cuda_rigid_body_data: Table
@@ -48,7 +48,7 @@ class BatchSystem:
 
     @property
     def __class__(self) -> type:
-        """`PhysxGpuSystem`, for ManiSkill's structs, which choose their buffers by ``isinstance``."""
+        """`PhysxGpuSystem`, because ManiSkill's structs choose their buffers by ``isinstance``."""
         return physx.PhysxGpuSystem
 
     # ---- stepping --------------------------------------------------------------------------------
@@ -73,7 +73,7 @@ class BatchSystem:
 
     @property
     def profile(self) -> StepProfile | None:
-        """Where times are added up, or None to measure nothing."""
+        """The profile to which times are added, or None."""
         return self.stepper.profile
 
     @profile.setter
@@ -85,28 +85,28 @@ class BatchSystem:
         self.stepper.step()
 
     def defer(self, steps: int) -> None:
-        """Let up to ``steps`` steps wait, see `Stepper.defer`; ``defer(0)`` makes up for them."""
+        """Defer up to ``steps`` physics steps, see `Stepper.defer`; ``defer(0)`` executes them."""
         self.stepper.defer(steps)
 
     def flush(self) -> None:
-        """Do what waits, so that sapien objects may be used directly."""
+        """Execute pending writes and steps, so that SAPIEN objects may be used directly."""
         self.stepper.flush()
 
     def invalidate(self) -> None:
-        """Declare everything read so far out of date, after sapien objects were changed directly."""
+        """Declare all values out of date, after SAPIEN objects were changed directly."""
         self.stepper.changed(range(len(self._systems)))
 
     # ---- tables ----------------------------------------------------------------------------------
 
     def build(self, actors: Mapping[str, Any], articulations: Mapping[str, Any]) -> None:
-        """Number the bodies and articulations of a finished scene and make its tables.
+        """Assign rows to the bodies and articulations of a finished scene and make its tables.
 
         Args:
             actors: ManiSkill actors by name; static ones get no rows.
             articulations: ManiSkill articulations by name.
 
         Raises:
-            RuntimeError: if this version of SAPIEN packs its state in an unknown order.
+            RuntimeError: the installed SAPIEN packs its state in an unknown order.
         """
         self.layout = Layout(actors, articulations)
         self.stepper.refresh()
@@ -117,7 +117,7 @@ class BatchSystem:
         self.__dict__.update(self._tables)
 
     def _find_values(self) -> None:
-        """Locate all values anew: the packed state has another length now, as after a camera was added."""
+        """Computes the indices of all values again, after the length of the packed state changed."""
         self.pose_index = pose_index(self.layout, self._scenes, self.stepper.poses)
         self.state_index = state_index(self.layout, self._systems, self.stepper.state)
         for table in self._tables.values():
@@ -125,28 +125,28 @@ class BatchSystem:
 
     @contextmanager
     def writing_bodies(self, rows: np.ndarray) -> Iterator[None]:
-        """Around a direct change of bodies with these rows."""
+        """Context for direct changes of the bodies of these rows."""
         with self.stepper.writing(self.layout.body_environment[rows].tolist()):
             yield
 
     @contextmanager
     def writing_articulations(self, rows: np.ndarray) -> Iterator[None]:
-        """Around a direct change of articulations with these rows."""
+        """Context for direct changes of the articulations of these rows."""
         with self.stepper.writing(self.layout.articulation_environment[rows].tolist()):
             yield
 
     def body_rows(self, bodies: Sequence[Any]) -> list[int]:
-        """Rows of sapien bodies in ``cuda_rigid_body_data``."""
+        """Rows of SAPIEN bodies in ``cuda_rigid_body_data``."""
         return [self.layout.row_of[id(body)] for body in bodies]
 
     def articulation_rows(self, articulations: Sequence[Any]) -> list[int]:
-        """Rows of sapien articulations in the ``cuda_articulation_*`` tables."""
+        """Rows of SAPIEN articulations in the ``cuda_articulation_*`` tables."""
         return [self.layout.articulation_of[id(articulation)] for articulation in articulations]
 
     # ---- nothing to do ---------------------------------------------------------------------------
 
     def _done_already(self) -> None:
-        """Writes are in the simulator when they are made, reads are made when they are asked for."""
+        """Does nothing: writes go to the simulator directly, reads are made on demand."""
 
     gpu_init = _done_already
     gpu_apply_rigid_dynamic_data = gpu_fetch_rigid_dynamic_data = _done_already
@@ -162,13 +162,13 @@ class BatchSystem:
     gpu_update_articulation_kinematics = _done_already
 
     def sync_poses_gpu_to_cpu(self) -> None:
-        """Make waiting steps, so that sapien objects may be used directly (to render them, for example)."""
+        """Execute pending steps, so that SAPIEN objects may be used directly, for example to render them."""
         self.flush()
 
     # ---- contacts --------------------------------------------------------------------------------
 
     def get_contacts(self) -> list[physx.PhysxContact]:
-        """Contacts of all environments in the last step. Do not keep them: the next step frees them."""
+        """Contacts of all environments in the last step; do not keep them, because the next step frees them."""
         self.flush()
         return [contact for system in self._systems for contact in system.get_contacts()]
 
@@ -181,19 +181,19 @@ class BatchSystem:
         return self.stepper.contacts.bodies(bodies)
 
     def gpu_query_contact_pair_impulses(self, query: PairImpulses) -> None:
-        """Bring ``query.cuda_impulses`` up to date; N s, shape (pairs, 3)."""
+        """Evaluate a query: ``query.cuda_impulses`` (pairs, 3) [N s]."""
         self.stepper.scan_contacts(self.stepper.contacts)
         self.stepper.contacts.answer(query)
 
     def gpu_query_contact_body_impulses(self, query: BodyImpulses) -> None:
-        """Bring ``query.cuda_impulses`` up to date; N s, shape (bodies, 3)."""
+        """Evaluate a query: ``query.cuda_impulses`` (bodies, 3) [N s]."""
         self.gpu_query_contact_pair_impulses(query)
 
     # ---- other things of the systems -------------------------------------------------------------
 
     @property
     def systems(self) -> list[physx.PhysxCpuSystem]:
-        """The systems of the environments, with no step waiting."""
+        """The systems of the environments, after all pending steps."""
         self.flush()
         return self._systems
 
@@ -213,5 +213,5 @@ class BatchSystem:
         return [link for system in self._systems for link in system.articulation_link_components]
 
     def get_scene_offset(self, scene: sapien.Scene) -> np.ndarray:
-        """Zero: every environment has its own world. Shape (3,), m."""
+        """(3,) zero, because every environment has its own world [m]."""
         return np.zeros(3, np.float32)

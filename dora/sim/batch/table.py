@@ -1,4 +1,4 @@
-"""Tables of live simulator values that look like the CUDA arrays ManiSkill's tasks read and write."""
+"""Tables of live simulator values with the interface of the CUDA arrays that ManiSkill reads and writes."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -13,14 +13,14 @@ from torch import Tensor
 from dora.sim.batch.packed import Source
 
 _PLANS_KEPT = 1024
-"""Reading plans remembered per table; few are needed: ManiSkill's structs index with the same tensors for ever."""
+"""Largest number of reading plans kept per table; few are needed, because ManiSkill indexes with the same tensors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Where some elements of a table come from: ``source.flat()[index]``.
+    """The source of some elements of a table: ``source.flat()[index]``.
 
-    ``where`` are their positions in the flattened result, or None if they are all of it (``index`` then has
+    ``where`` are their positions in the flattened result, or None if they are the whole result (``index`` then has
     its shape).
     """
 
@@ -30,12 +30,15 @@ class Part:
 
 
 Planner = Callable[[np.ndarray], Sequence[Part]]
+"""Function from element numbers to the parts from which they are read."""
 Writer = Callable[[np.ndarray, np.ndarray], None]
+"""Function that writes values (second argument) to element numbers (first argument)."""
 Writing = Callable[[np.ndarray], AbstractContextManager[None]]
+"""Function from rows to the context in which they are changed."""
 
 
 def assemble(parts: Sequence[Part], shape: tuple[int, ...]) -> np.ndarray:
-    """Float32 array of ``shape`` from its parts; a new array, safe to keep and to change."""
+    """A new float32 array of ``shape`` from its parts."""
     if len(parts) == 1 and parts[0].where is None:
         return parts[0].source.flat().take(parts[0].index)
     result = np.empty(prod(shape), np.float32)
@@ -47,15 +50,15 @@ def assemble(parts: Sequence[Part], shape: tuple[int, ...]) -> np.ndarray:
 class Table:
     """A table of simulator values with the interface of a `sapien.CudaArray`.
 
-    ``table.torch()[key]`` reads the values of now, only those asked for, and returns a new tensor;
-    ``table.torch()[key] = value`` writes them into the simulator at once. Nothing is stored in between, so
-    there is nothing to fetch and nothing to apply.
+    ``table.torch()[key]`` reads the current values of the elements asked for and returns a new tensor;
+    ``table.torch()[key] = value`` writes them into the simulator directly. Nothing is stored in between, so
+    there is nothing to fetch or to apply.
 
     Args:
-        shape: shape of the table; the first axis numbers bodies or articulations.
-        plan: maps element numbers (of the flattened table) to the parts they are read from.
-        write: takes element numbers and values of equal shape and sets them in the simulator.
-        refresh: called before every read, brings the sources up to date.
+        shape: shape of the table; the first axis is that of bodies or articulations.
+        plan: maps element numbers (of the flattened table) to the parts from which they are read.
+        write: sets values in the simulator, given element numbers and values of equal shape.
+        refresh: called before every read to make the sources current.
     """
 
     def __init__(self, shape: tuple[int, ...], plan: Planner, write: Writer, refresh: Callable[[], None]):
@@ -71,11 +74,11 @@ class Table:
         return self._elements.shape
 
     def torch(self) -> "Table":
-        """The table itself: index it like a tensor."""
+        """The table itself, to be indexed like a tensor."""
         return self
 
     def forget_plans(self) -> None:
-        """Plan all reads anew, because the sources were laid out differently."""
+        """Drop all reading plans, after the layout of the sources changed."""
         self._plans.clear()
 
     def __getitem__(self, key: Any) -> Tensor:
@@ -115,7 +118,7 @@ class Table:
 
     @classmethod
     def __torch_function__(cls, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
-        """Let torch functions take a table where they take a tensor: they get a copy of it."""
+        """Lets torch functions accept a table as a tensor, of which they get a copy."""
         if function.__name__.endswith("_") and not function.__name__.endswith("__"):
             raise TypeError(f"write with table[...] = value: {function.__name__}() would change a copy")
         args = tuple(arg[...] if isinstance(arg, cls) else arg for arg in args)
@@ -124,7 +127,7 @@ class Table:
 
 
 def _signature(key: Any) -> tuple:
-    """A hashable stand-in for an index; tensors count by identity (the plan keeps them alive)."""
+    """A hashable key of an index; tensors are identified by ``id`` (the plan keeps them alive)."""
     if isinstance(key, tuple):
         return tuple(_signature(part) for part in key)
     if isinstance(key, slice):
@@ -135,11 +138,13 @@ def _signature(key: Any) -> tuple:
 
 
 class BlockWriter:
-    """Writes the blocks of a row by their setters: ``blocks`` holds (columns, one setter or None per row).
+    """Writes the blocks of a row by their setters, in the order given.
 
-    Blocks go in the order given. A block that is written in part keeps the current values of its other
-    columns, which ``read`` returns for element numbers. ``writing(rows)`` is a context around the setters'
-    calls.
+    Args:
+        width: number of columns of a row.
+        blocks: per block its columns, and for each row a setter or None.
+        read: function from element numbers to current values, which a block written in part keeps in its other columns.
+        writing: function from rows to the context of the setters' calls.
     """
 
     def __init__(
@@ -167,7 +172,7 @@ class BlockWriter:
                         setter(new[i, block])
 
     def _current(self, rows: np.ndarray, touched: np.ndarray) -> np.ndarray:
-        """Rows to overwrite; read only if some block is written in part."""
+        """The rows before the write; read only if a block is written in part."""
         if any(touched[:, block].any() and not touched[:, block].all() for block, _ in self._blocks):
             return self._read(rows[:, None] * self._width + np.arange(self._width))
         return np.zeros(touched.shape, np.float32)

@@ -1,1 +1,1 @@
-"""Grasps put to the test in simulation by a hand without an arm: shaken, lifted, ranked, bundled."""
+"""Grasp tests in simulation by a hand without an arm: shaking, lifting, ranking, and the making of bundled sets."""

@@ -1,4 +1,4 @@
-"""Make the set of grasps that comes with Dora: searched, filtered, validated, ranked by execution, best first."""
+"""Making of a bundled set: grasps are searched, filtered for reach, validated, and ranked by executing them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dora.affordance.bundled_sets import ROBOT, bundled_path
 from dora.affordance.candidates import GraspCandidates, concatenate
-from dora.affordance.hand.protocol import STANDARD
+from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.approach_directions import free_approaches
@@ -28,38 +28,38 @@ from dora.sim.grasp_tests.lift_test import Execution, rank
 from dora.sim.grasp_tests.shake_test import validate
 
 ROUND = 192
-"""Candidates searched at a time for the target region."""
+"""Number of candidates per round of the search for the target region."""
 MOST_ROUNDS = 20
-"""Rounds after which a region has to have enough."""
+"""Largest number of rounds of the search for the target region."""
 POOL = 240
-"""Grasps of the target region that are ranked."""
+"""Number of valid grasps of the target region that are ranked."""
 KEPT = 96
-"""The best of them that are bundled."""
-FEWEST = 64
-"""Grasps of the target region below which nothing is bundled."""
+"""Number of the best of them that are bundled."""
+FEWEST_GRASPS = 64
+"""Smallest number of valid grasps of the target region from which a set is made."""
 PLACES = Grid((0.55, 0.0), (0.08, 0.08), spacing=0.08, yaws=12)
-"""Where objects on a table may stand: a grasp has to be feasible somewhere."""
-FEASIBLE = 0.03
-"""Share of those places from which a grasp is kept."""
+"""Places and yaws of objects on a table at which grasps are tested for reach."""
+FEASIBLE_SHARE = 0.03
+"""Smallest share of those places at which a grasp must be feasible [1]."""
 OTHERS = 64
-"""Candidates searched for each other region."""
+"""Number of candidates searched for each other region."""
 OTHERS_KEPT = 32
-"""The best of them that are bundled."""
+"""Number of the best of them that are bundled."""
 
 
 Usable = Callable[[GraspCandidates], Bool[Tensor, " c"]]
-"""Tells which grasps a task can use."""
+"""Function that returns the mask (c,) of grasps that a task can use."""
 
 
 def make_bundle(name: str, seed: int, phases: PhaseProgress, usable: Usable | None = None) -> Path:
-    """Make and write the bundled set of an object; returns its file.
+    """Make and write the bundled set of an object; returns the path of its file.
 
     Args:
         name: of an object or its folder, as for `load_object`.
-        seed: of all random draws.
-        phases: where progress is shown.
-        usable: what the object's task can use; the best grasps of the target region are chosen among those, and some
-            of the others follow.
+        seed: seed of all random draws.
+        phases: display of the progress.
+        usable: mask of the grasps that the object's task can use. The best grasps of the target region are chosen among
+            those; grasps of the other regions and unusable ones follow.
 
     Raises:
         InputError: unknown object, one without a folder, or too few valid grasps.
@@ -70,7 +70,7 @@ def make_bundle(name: str, seed: int, phases: PhaseProgress, usable: Usable | No
 
 
 class SetMaker:
-    """Makes the bundled set of one object for one robot; `usable` as of `make_bundle`."""
+    """Makes the bundled set of one object for one robot; `usable` as in `make_bundle`."""
 
     def __init__(
         self, obj: AffordanceObject, robot: RobotDescription, phases: PhaseProgress, usable: Usable | None = None
@@ -79,17 +79,25 @@ class SetMaker:
         self.reach = Reach(robot, obj, start=obj.start_posture)
 
     def make(self, seed: int) -> GraspCandidates:
-        """The best grasps of the target region, then those of the others; InputError if there are too few."""
+        """The best grasps of the target region, then those of the other regions.
+
+        Raises:
+            InputError: there are too few valid grasps of the target region.
+        """
         parts = [self.ranked(self.pool(seed)).select(slice(KEPT))]
         for index, label in enumerate(self.obj.labels):
             if label != self.obj.target or self.usable is not None:
                 found = self.valid(OTHERS, seed + MOST_ROUNDS + index, label)
                 parts += [] if found is None else [self.ranked(found).select(slice(OTHERS_KEPT))]
-        made = {"search": repr(Settings()), "protocol": repr(STANDARD), "ranking": repr(Execution()), "seed": seed}
+        made = {"search": repr(Settings()), "grasp_test": repr(STANDARD), "ranking": repr(Execution()), "seed": seed}
         return replace(concatenate(parts), settings=json.dumps(made))
 
     def pool(self, seed: int) -> GraspCandidates:
-        """`POOL` valid grasps of the target region, or as many as there are."""
+        """Up to `POOL` valid grasps of the target region.
+
+        Raises:
+            InputError: there are fewer than `FEWEST_GRASPS`.
+        """
         sets: list[GraspCandidates] = []
         for index in range(MOST_ROUNDS):
             found = self.valid(ROUND, seed + index, self.obj.target, self.usable)
@@ -97,14 +105,17 @@ class SetMaker:
             if sum(map(len, sets)) >= POOL:
                 break
         count = sum(map(len, sets))
-        if count < FEWEST:
+        if count < FEWEST_GRASPS:
             name, target = self.obj.name, self.obj.target
-            raise InputError(f"{name}: only {count} grasps of {target!r} are valid, and {FEWEST} are needed.")
+            raise InputError(f"{name}: only {count} grasps of {target!r} are valid, and {FEWEST_GRASPS} are needed.")
         return concatenate(sets).select(slice(POOL))
 
     def valid(self, num: int, seed: int, label: str, usable: Usable | None = None) -> GraspCandidates | None:
-        """Those of `num` candidates that hold `label`, are usable, free on an approach and strictly valid; None if
-        none is."""
+        """Those of `num` candidates that hold `label`, are usable, have a free approach, and are strictly valid.
+
+        Returns:
+            The candidates; None if none is left.
+        """
         found = optimise(
             self.obj, self.robot, num, seed, label, progress=self.phase(f"search {label}", 1 / Settings().iterations)
         )
@@ -119,7 +130,7 @@ class SetMaker:
                 return None
             found = found.select(free)
             places = poses(PLACES.nodes(), self.obj.support, self.obj.rest)
-            feasible = self.reach.filter(found, *places, exact=False).reachable.float().mean(0) >= FEASIBLE
+            feasible = self.reach.filter(found, *places, exact=False).reachable.float().mean(0) >= FEASIBLE_SHARE
             if not feasible.any():
                 return None
             found = found.select(feasible)
@@ -127,21 +138,21 @@ class SetMaker:
         return found.select(verdict.strict) if verdict.strict.any() else None
 
     def ranked(self, candidates: GraspCandidates) -> GraspCandidates:
-        """With scores, best first: by lifts from the table, or by holds in the air of what is not on one."""
+        """The candidates with scores, best first: by lifts from the table, else by grasp tests without a table."""
         report = self.phase(f"rank {candidates.grasp_class[0]}")
         if self.obj.on_table:
             score = rank(candidates, self.obj, self.robot, progress=report)
         else:
-            score = holds(candidates, self.obj, self.robot, report)
+            score = rank_by_shaking(candidates, self.obj, self.robot, report)
         order = torch.argsort(score, descending=True, stable=True)
         return replace(candidates, score=score).select(order)
 
     def phase(self, name: str, scale: float = 1.0) -> Callable[[int, int], None]:
-        """A progress bar."""
+        """A progress bar for one phase; `scale` converts what it is called with to candidates."""
         return self.phases.phase(f"{self.obj.name}: {name}", "candidates", scale)
 
 
-def holds(
+def rank_by_shaking(
     candidates: GraspCandidates,
     obj: AffordanceObject,
     robot: RobotDescription,
@@ -149,7 +160,16 @@ def holds(
     execution: Execution | None = None,
     seed: int = 0,
 ) -> Float[Tensor, " c"]:
-    """Share of validations passed with errors of the wrist's pose, drawn as `Execution` says, without a table."""
+    """Share of grasp tests passed under errors of the wrist's pose, without a table.
+
+    Args:
+        candidates: c candidates of this object and this robot.
+        obj: the object.
+        robot: the robot whose hand grasps.
+        progress: called with the number of tests done and their total.
+        execution: its `draws`, `position` and `rotation` are used.
+        seed: seed of the errors.
+    """
     e, count = execution or Execution(), len(candidates)
     draw = torch.Generator().manual_seed(seed)
     rows = torch.arange(count).repeat(e.draws)

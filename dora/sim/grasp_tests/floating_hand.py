@@ -1,4 +1,4 @@
-"""A robot's hand without its arm: the palm is held in space, or moved in straight lines by a carriage."""
+"""A robot's hand without its arm: the palm is fixed in space, or moved in straight lines by a carriage."""
 
 import numpy as np
 import sapien
@@ -10,32 +10,32 @@ from dora.robot import RobotDescription
 from dora.sim.shapes import collision_shape
 
 PALM, FIRST_FINGER = 0, 1
-"""Rows of the palm and of the first finger wherever hand parts are counted."""
+"""Indices of the palm and of the first finger among the hand parts."""
 CARRIAGE_STIFFNESS = 2e4
-"""Drive of the carriage along each axis [N/m]; the grip of the arm's drives seen at the wrist."""
+"""Stiffness of the carriage's drive along each axis, about that of the arm's drives at the wrist [N/m]."""
 CARRIAGE_DAMPING = 4e2
-"""[N s/m]"""
+"""Damping of the carriage's drive along each axis [N s/m]."""
 CARRIAGE_FORCE = 200.0
 """Largest force of the carriage along each axis [N]."""
 CARRIAGE_REACH = 2.0
-"""Travel to both sides [m]."""
+"""Travel of each slide to both sides [m]."""
 CARRIAGE_MASS = 0.5
 """Mass of each slide [kg]."""
 
 
 class FloatingHand:
-    """The hand of a robot, joints in the order of its description; weightless.
+    """The weightless hand of a robot, with joints in the order of the robot's description.
 
     Args:
-        scene: where the hand is built.
-        robot: whose hand it is.
-        friction: coefficient of all its links, instead of the description's.
-        iterations: position and velocity iterations of the solver.
-        carriage: whether the palm rides on three slides along the axes of the root's frame.
+        scene: scene in which the hand is built.
+        robot: the robot whose hand is built.
+        friction: Coulomb coefficient of all links, instead of the description's [1].
+        iterations: numbers of position and velocity iterations of the solver.
+        carriage: whether the palm is mounted on three slides along the axes of the root frame.
 
     Attributes:
         parts: number of hand parts: the palm, then the fingers in the description's order.
-        part_of: hand part by `id` of a link's body.
+        part_of: index of the hand part by `id` of a link's body.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class FloatingHand:
         self.articulation: physx.PhysxArticulation = bodies[robot.wrist_link].articulation
         self.articulation.set_solver_position_iterations(iterations[0])
         self.articulation.set_solver_velocity_iterations(iterations[1])
-        self._bodies = bodies  # kept alive: their ids are keys
+        self._bodies = bodies  # keeps the bodies alive, whose ids are keys
         self._name_parts(robot)
         self._set_drives(robot)
 
@@ -84,7 +84,7 @@ class FloatingHand:
         self._joints = [joints[name] for name in robot.hand.names]
         place = {joint.name: index for index, joint in enumerate([*self._slides, *self._joints])}
         self._order = [place[joint.name] for joint in active]
-        """Per joint of the articulation: its index in slides followed by hand joints."""
+        """Per joint of the articulation: its index among the slides followed by the hand joints."""
         for slide in self._slides:
             slide.set_drive_properties(CARRIAGE_STIFFNESS, CARRIAGE_DAMPING, CARRIAGE_FORCE, "force")
         hand = robot.hand
@@ -93,12 +93,12 @@ class FloatingHand:
             joint.set_armature(np.array([hand.armature[i]], np.float32))
 
     def reset(self, joints: np.ndarray, root: sapien.Pose | None = None, offset: np.ndarray | None = None) -> None:
-        """Puts the hand at rest and commands it to stay.
+        """Places the hand at rest and commands it to stay there.
 
         Args:
-            joints: (20,) [rad].
-            root: pose of the root in the world; stays if None.
-            offset: (3,) of the palm from the root, in the root's frame [m]; only on a carriage, 0 if None.
+            joints: (20,) hand joints [rad].
+            root: pose of the root in the world; unchanged if None.
+            offset: (3,) offset of the palm in the root frame [m]; zero if None. Only with a carriage.
         """
         if root is not None:
             self.articulation.set_root_pose(root)
@@ -109,31 +109,31 @@ class FloatingHand:
         self.move(slides.tolist())
 
     def command(self, joints: np.ndarray) -> None:
-        """Sends the drives towards joints (20,) [rad]."""
+        """Sets the drive targets of the hand joints (20,) [rad]."""
         for joint, angle in zip(self._joints, joints.tolist(), strict=True):
             joint.set_drive_target(angle)
 
     def move(self, offset: list[float]) -> None:
-        """Sends the slides towards an offset (3,) of the palm in the root's frame [m]."""
+        """Sets the drive targets of the slides: offset (3,) of the palm in the root frame [m]."""
         for slide, value in zip(self._slides, offset, strict=True):
             slide.set_drive_target(value)
 
     @property
     def lag(self) -> float:
-        """Distance of the palm from where the slides were sent [m]."""
+        """Distance of the palm from the drive targets of the slides [m]."""
         qpos = self.articulation.qpos
         ahead = [slide.drive_target[0] - qpos[self._order.index(i)] for i, slide in enumerate(self._slides)]
         return float(np.linalg.norm(ahead))
 
 
 _SLIDES = ("slide_x", "slide_y", "slide_z")
-_Z, _Y = (0.0, 0.0, 0.5**0.5), (0.0, 0.5**0.5, 0.0)
-_SLIDE_TURNS = ((1.0, 0.0, 0.0, 0.0), (0.5**0.5, *_Z), (0.5**0.5, 0.0, -(0.5**0.5), 0.0))
-"""Turns of the slides' frames (wxyz): a prismatic joint moves along its frame's x."""
+"""Names of the joints of the carriage."""
+_SLIDE_TURNS = ((1.0, 0.0, 0.0, 0.0), (0.5**0.5, 0.0, 0.0, 0.5**0.5), (0.5**0.5, 0.0, -(0.5**0.5), 0.0))
+"""Orientations (wxyz) of the slides' frames: a prismatic joint moves along its frame's x."""
 
 
 def _hand_builder(scene: sapien.Scene, robot: RobotDescription) -> ArticulationBuilder:
-    """Builder of the links from the wrist outwards, with their inertia, without shapes."""
+    """Builder of the wrist link and all links that it carries, with their inertias, without shapes."""
     loader = URDFLoader()
     loader.set_scene(scene)
     builder = loader.parse(str(robot.urdf))[0][0]
@@ -153,7 +153,7 @@ def _hand_builder(scene: sapien.Scene, robot: RobotDescription) -> ArticulationB
 
 
 def _put_on_carriage(builder: ArticulationBuilder, palm: str) -> None:
-    """Three slides before the palm."""
+    """Inserts the three slides between the root and the palm."""
     hand, parent = builder.link_builders, None
     builder.link_builders = []
     for name in ("rail", *_SLIDES[:2]):

@@ -1,4 +1,4 @@
-"""From an object to judged grasps: search, validation in simulation, and the numbers that are reported."""
+"""From an object to validated grasps: search, grasp test in simulation, and the reported numbers."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from jaxtyping import Int
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.protocol import STANDARD, Protocol
-from dora.affordance.maps.confusion import Agreement, clearly_held
+from dora.affordance.hand.grasp_test_settings import STANDARD, GraspTestSettings
+from dora.affordance.maps.confusion import Confusion, clearly_dominant
 from dora.affordance.maps.voting import vote
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.search.cache import map_of
@@ -27,38 +27,39 @@ from dora.robot import RobotDescription
 from dora.sim.grasp_tests.shake_test import Validation, validate
 
 MILLIMETRES = 1000.0
-"""Per metre."""
+"""Millimetres per metre [1]."""
 _NO_CLOSURE = Weights(closure=0.0)
+"""Weights of the energy without E_DFC."""
 BASELINES = {
     "no_closure": Settings(weights=_NO_CLOSURE),
     "unseated": Settings(seat=0.0),
     "unseated_no_closure": Settings(weights=_NO_CLOSURE, seat=0.0),
     "unseated_one_iteration": Settings(iterations=1, seat=0.0),
 }
-"""Searches that lack what they are compared for: the weight of E_DFC is 0; the hand is not closed around the object
-after the search (`unseated`), which mends much of what a search lacks; both; or there is no search."""
+"""Settings of searches for comparison, each without one part: without E_DFC; without closing the hand around the object
+after the search (`unseated`); without both; with a single iteration."""
 
 
 CANDIDATE, CLOSED = "candidate", "closed_hand"
-"""Which contacts vote: those at the candidate, or those of the simulated hand after closing."""
+"""Kinds of contacts that vote: those stored with the candidate, and those of the simulated hand after closing."""
 FREE = "any"
 """Name of a search without a region."""
 
 
 @dataclass(frozen=True, eq=False)
 class Generated:
-    """Candidates with the verdict on each, and what it took.
+    """Candidates of a search with the results of their validation.
 
     Attributes:
-        candidates: all that the search gave; `valid` if they passed the simulation (when there was one) and stay
-            below the protocol's penetration; without a simulation, if they touch and stay below it. Once simulated,
-            their class is what the contacts of the closed hand vote for.
-        requested: number asked for.
-        region: label asked for, None for a free search.
-        seed: of the search.
-        optimise_seconds, validate_seconds: wall time [s].
-        verdict: of the simulation; None without one.
-        voting: votes of the contacts at the candidate and of those of the closed hand; empty without a simulation.
+        candidates: all candidates of the search. After a simulation they are `valid` if they passed and are within the
+            grasp test's penetration limit, and their class is the vote of the closed hand's contacts. Without one they
+            are `valid` if they touch and are within that limit.
+        requested: number of candidates asked for.
+        region: label asked for; None for a search without a region.
+        seed: seed of the search.
+        optimise_seconds, validate_seconds: wall time of search and validation [s].
+        verdict: results of the simulation; None without one.
+        voting: votes (c,) by the kind of contacts, `CANDIDATE` and `CLOSED`; empty without a simulation.
     """
 
     candidates: GraspCandidates
@@ -80,22 +81,22 @@ def generate(
     phases: PhaseProgress,
     simulate: bool = True,
     settings: Settings | None = None,
-    protocol: Protocol = STANDARD,
+    test_settings: GraspTestSettings = STANDARD,
     name: str = "grasps",
 ) -> Generated:
-    """Search for grasps and judge them.
+    """Search for grasps and validate them.
 
     Args:
-        obj: object.
-        robot: whose hand it is.
-        num: candidates wanted.
-        seed: of all random draws.
-        region: label to be held; None leaves it open.
-        phases: where progress is shown.
-        simulate: whether to validate in SAPIEN; otherwise penetration and touch decide.
-        settings: of the search.
-        protocol: of the validation.
-        name: of this run, for the progress.
+        obj: the object.
+        robot: the robot whose hand grasps.
+        num: number of candidates.
+        seed: seed of all random draws.
+        region: label of the region to be held; None for any.
+        phases: display of the progress.
+        simulate: whether to validate in SAPIEN; otherwise penetration depth and contact at the candidate decide.
+        settings: settings of the search; the defaults if None.
+        test_settings: settings of the grasp test.
+        name: name of this run in the progress display.
 
     Raises:
         InputError: `num` is less than 1, or the object has no such region or does not suit the hand.
@@ -109,22 +110,22 @@ def generate(
     between = time.perf_counter()
     verdict, voting = None, {}
     if simulate:
-        verdict = validate(found, obj, robot, protocol, progress=phases.phase(f"{name}: simulation", "candidates"))
+        verdict = validate(found, obj, robot, test_settings, progress=phases.phase(f"{name}: simulation", "candidates"))
         valid, voting = verdict.valid, votes(found, verdict, obj)
         found = replace(found, grasp_class=_classes(found, voting[CLOSED], obj))
     else:
-        valid = (found.penetration <= protocol.penetration) & (found.contact_finger > 0).any(1)
+        valid = (found.penetration <= test_settings.penetration) & (found.contact_finger > 0).any(1)
     end = time.perf_counter()
-    judged = repr(protocol) if simulate else None
-    origin = {"search": found.settings, "region": region, "seed": seed, "protocol": judged}
+    tested = repr(test_settings) if simulate else None
+    origin = {"search": found.settings, "region": region, "seed": seed, "grasp_test": tested}
     candidates = replace(found, valid=valid, settings=json.dumps(origin))
     return Generated(candidates, num, region, seed, between - start, end - between, verdict, voting)
 
 
 def summary(generated: Generated) -> dict[str, Any]:
-    """What is reported of a run, as JSON can hold it. Shares are of all candidates; lengths in mm.
+    """The report of a run as values for JSON; docs/affordance.md explains the keys.
 
-    `penetration_mm` and `energy` are over all candidates, `classes` counts the valid ones.
+    Shares, `penetration_mm` and `energy` are over all candidates, `classes` over the valid ones.
     """
     c = generated.candidates
     valid, verdict = int(c.valid.sum()), generated.verdict
@@ -162,7 +163,7 @@ def baselines(
     phases: PhaseProgress,
     simulate: bool = True,
 ) -> dict[str, dict[str, Any]]:
-    """Summaries of `BASELINES`; arguments as of `generate`."""
+    """Summaries of searches with the settings in `BASELINES`, by name; arguments as for `generate`."""
     return {
         name: summary(generate(obj, robot, num, seed, region, phases, simulate, settings, name=name))
         for name, settings in BASELINES.items()
@@ -172,9 +173,9 @@ def baselines(
 def by_region(
     obj: AffordanceObject, robot: RobotDescription, num: int, seed: int, region: str | None, phases: PhaseProgress
 ) -> dict[str, Generated]:
-    """Simulated grasps of a free search ("any") and of one for each region, but for the one that is `region`.
+    """Validated grasps of a search without a region ("any") and of one for each region other than `region`, by name.
 
-    Other arguments as of `generate`.
+    Other arguments as for `generate`.
     """
     others = {FREE: None} | {label: label for label in obj.labels}
     return {
@@ -185,7 +186,7 @@ def by_region(
 
 
 def votes(candidates: GraspCandidates, verdict: Validation, obj: AffordanceObject) -> dict[str, Int[Tensor, " c"]]:
-    """Regions that the contacts vote for, at the candidate and after closing; -1 without contact."""
+    """Votes of the contacts stored with the candidates and of those after closing; -1 without contact."""
     regions = map_of(obj, "cpu")
     return {
         CANDIDATE: vote(regions, candidates.contacts.cpu(), candidates.contact_finger.cpu()),
@@ -194,14 +195,14 @@ def votes(candidates: GraspCandidates, verdict: Validation, obj: AffordanceObjec
 
 
 def voting_summary(several: Iterable[Generated], obj: AffordanceObject) -> dict[str, Any]:
-    """Agreement of the votes with the region that carries most contact force after closing, as JSON can hold it.
+    """Agreement of the votes with the region of largest contact force after closing, as values for JSON.
 
-    Over the simulated grasps of all searches together whose hand presses on the object after closing: "all", "clear"
-    where one region carries two thirds of the force or more, and the same of the "valid" ones, which tasks use.
+    The groups are the simulated grasps of all searches together with contact force after closing ("all"), those with
+    a dominant region ("clear", see `clearly_dominant`), and the valid ones among both ("valid", "valid_clear").
     """
     simulated = [(g.verdict, g.voting) for g in several if g.verdict is not None]
     force = torch.cat([verdict.label_force for verdict, _ in simulated])
-    pressed, clear = force.sum(1) > 0, clearly_held(force)
+    pressed, clear = force.sum(1) > 0, clearly_dominant(force)
     valid = torch.cat([verdict.valid for verdict, _ in simulated])
     voted = {kind: torch.cat([votes[kind] for _, votes in simulated]) for kind in (CANDIDATE, CLOSED)}
     groups = {"all": pressed, "clear": clear, "valid": pressed & valid, "valid_clear": clear & valid}
@@ -209,23 +210,23 @@ def voting_summary(several: Iterable[Generated], obj: AffordanceObject) -> dict[
     for group, rows in groups.items():
         found[group] = {"grasps": int(rows.sum())}
         for kind, choice in voted.items():
-            agreement = Agreement.of(obj.labels, choice[rows], force[rows].argmax(1))
+            confusion = Confusion.of(obj.labels, choice[rows], force[rows].argmax(1))
             found[group][kind] = {
-                "balanced_accuracy": agreement.balanced_accuracy,
-                "recall": agreement.recall,
-                "confusion": agreement.confusion.tolist(),
+                "balanced_accuracy": confusion.balanced_accuracy,
+                "recall": confusion.recall,
+                "confusion": confusion.counts.tolist(),
             }
     return found
 
 
 def _classes(candidates: GraspCandidates, voted: Int[Tensor, " c"], obj: AffordanceObject) -> tuple[str, ...]:
-    """The classes of what is voted for; where nothing is, the candidates' own."""
+    """Grasp classes of the voted regions; the candidates' own where there is no vote."""
     own = candidates.grasp_class
     return tuple(obj.classes[label] if label >= 0 else own[row] for row, label in enumerate(voted.tolist()))
 
 
 def origin_digest(candidates: GraspCandidates) -> str:
-    """sha256 of what candidates depend on: object, robot and settings."""
+    """sha256 of everything on which candidates depend: object, robot and settings."""
     origin = [candidates.digest, candidates.robot_digest, candidates.settings]
     return hashlib.sha256(json.dumps(origin).encode()).hexdigest()
 
@@ -235,7 +236,7 @@ def _share(mask: Tensor | None) -> float | None:
 
 
 def _spread(lengths: Tensor) -> dict[str, float]:
-    """Quantiles of lengths [m] in mm."""
+    """Median, 90th and 95th percentile and maximum [mm] of lengths [m]."""
     quantiles = torch.quantile(lengths.double(), torch.tensor([0.5, 0.9, 0.95, 1.0], dtype=torch.float64))
     names = ("median", "p90", "p95", "max")
     return {name: MILLIMETRES * float(value) for name, value in zip(names, quantiles, strict=True)}

@@ -1,9 +1,9 @@
-"""Ranking of grasp candidates by executing them: reach, close, lift from a table, hold.
+"""Ranking of grasp candidates by simulated executions: reach, close, lift from a table, hold.
 
-The palm rides on a carriage instead of the arm: it comes along the candidate's approach direction, closes as fast as
-the tasks' reference does, and rises. Every candidate is executed several times, with other masses, frictions and
-errors of its pose each time. Draws for ranking and for reporting are separate streams, so that the best of many are
-not reported with the luck they were chosen for.
+The palm is mounted on a carriage instead of the arm: it moves along the candidate's approach direction, the hand closes
+as fast as in the tasks, and the palm rises. Every candidate is executed several times with different masses,
+frictions and errors of the wrist's pose. Ranking and reporting draw from separate random streams, so that the reported
+rates of the best candidates are not biased by their selection.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.protocol import STANDARD
+from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.errors import InputError
 from dora.geometry.rotations import (
@@ -31,31 +31,36 @@ from dora.sim.grasp_tests.shake_test import check_object
 from dora.sim.grasp_tests.test_scene import GraspTestScene, Physics
 
 Purpose = Literal["ranking", "reporting"]
+"""Purposes of executions, each with its own random stream."""
 _STREAM: dict[Purpose, int] = {"ranking": 0, "reporting": 1}
-COMMANDS = 20.0
-"""Commands to the hand per second, as in the tasks [1/s]."""
-BLOCKED = 0.03
-"""Lag of the palm behind its command at which an approach has hit something [m]."""
+"""Number of the random stream by purpose."""
+COMMAND_RATE = 20.0
+"""Rate of commands to the hand, as in the tasks [1/s]."""
+BLOCKED_LAG = 0.03
+"""Lag of the palm behind its command at which an approach counts as blocked [m]."""
 
 
 @dataclass(frozen=True)
 class Execution:
-    """How candidates are executed, and what is drawn for each execution.
+    """Numbers of an execution, and the ranges from which each execution draws.
 
     Attributes:
-        draws: executions per candidate.
-        mass: range of the factor on the object's mass, uniform.
-        friction: range of the coefficient between object, hand and table, uniform.
-        position: largest error of the wrist's position along each axis of the object [m], uniform.
-        rotation: largest error of the wrist's orientation about each axis of the hand [rad], uniform.
-        standoff: where the approach begins, before the grasp [m].
-        speed: of the approach and of the lift [m/s].
-        closing_time: from the opened to the squeezing hand [s].
-        settling_time: before the lift [s].
-        height: rise of the palm [m].
-        lifted: rise of the object that counts [m].
-        hold: time at the top [s].
-        turn: largest change of the object's orientation from the table to the end of the hold [rad].
+        draws: number of executions per candidate.
+        mass: range of the factor on the object's mass, uniform [1].
+        friction: range of the Coulomb coefficient of object, hand and table, uniform [1].
+        position: largest error of the wrist's position along each axis of the object frame, uniform [m].
+        rotation: largest error of the wrist's orientation about each axis of the wrist frame, uniform [rad].
+        standoff: length of the approach [m].
+        speed: speed of the approach and of the lift [m/s].
+        closing_time: duration of the closing [s].
+        settling_time: time between closing and lift [s].
+        height: height of the lift of the palm [m].
+        lifted: rise of the object above which the lift succeeds [m].
+        hold: time for which the palm stays at the top [s].
+        turn: largest angle between the object's orientations on the table and in the end [rad].
+
+    Raises:
+        InputError: `draws` is below 1, or a range of `mass` or `friction` is not positive and ascending.
     """
 
     draws: int = 8
@@ -85,7 +90,16 @@ class Execution:
 
 @dataclass(frozen=True)
 class Lift:
-    """One execution: the wrist's pose in the world, unit approach (3,), joints (20,) [rad], mass [kg], friction."""
+    """One execution.
+
+    Attributes:
+        position: (3,) wrist at the grasp in the world [m].
+        quaternion: (4,) wrist at the grasp in the world, wxyz.
+        approach: (3,) unit direction of the approach in the world.
+        pregrasp, grasp: (20,) hand joints before closing and commanded by closing [rad].
+        mass: mass of the object [kg].
+        friction: Coulomb coefficient of object, hand and table [1].
+    """
 
     position: np.ndarray
     quaternion: np.ndarray
@@ -97,49 +111,49 @@ class Lift:
 
 
 class LiftTest:
-    """Executes one lift after the other; tells whether the object was up and steady in the end."""
+    """Executes lifts one after the other in one scene; arguments as for `rank`."""
 
     def __init__(self, obj: AffordanceObject, robot: RobotDescription, execution: Execution, physics: Physics):
         self.execution, self.physics = execution, physics
         self.rest = np.array([0.0, 0.0, obj.support]), np.array(obj.rest)
         gravity = (0.0, 0.0, -STANDARD.gravity)
-        self.rig = GraspTestScene(obj, robot, STANDARD.friction, physics, gravity, carriage=True, table=True)
+        self.scene = GraspTestScene(obj, robot, STANDARD.friction, physics, gravity, carriage=True, table=True)
 
     def __call__(self, lift: Lift) -> bool:
-        """Reach, close, lift and hold."""
-        e, rig = self.execution, self.rig
+        """Reach, close, lift and hold; returns whether the lift succeeded."""
+        e, scene = self.execution, self.scene
         turn = matrix_from_quaternion(torch.tensor(lift.quaternion)).numpy()
         before, above = -e.standoff * lift.approach @ turn, np.array([0.0, 0.0, e.height]) @ turn
         grasp = np.zeros(3)
-        rig.stage(*self.rest, lift.mass, lift.friction)
-        rig.hand.reset(lift.pregrasp, sapien.Pose(lift.position.tolist(), lift.quaternion.tolist()), before)
+        scene.stage(*self.rest, lift.mass, lift.friction)
+        scene.hand.reset(lift.pregrasp, sapien.Pose(lift.position.tolist(), lift.quaternion.tolist()), before)
         if not self._move(before, grasp):
             return False
         self._close(lift)
-        rig.run(self.physics.steps(e.settling_time))
+        scene.run(self.physics.steps(e.settling_time))
         self._move(grasp, above)
-        rig.run(self.physics.steps(e.hold))
+        scene.run(self.physics.steps(e.hold))
         return self._succeeded()
 
     def _move(self, begin: np.ndarray, end: np.ndarray) -> bool:
-        """Palm along a straight line, offsets (3,) from the grasp in its frame [m]; whether it got there."""
-        commands = max(1, round(float(np.linalg.norm(end - begin)) / self.execution.speed * COMMANDS))
+        """Moves the palm along a straight line between offsets (3,) in the root frame [m]; whether it arrived."""
+        commands = max(1, round(float(np.linalg.norm(end - begin)) / self.execution.speed * COMMAND_RATE))
         for command in range(1, commands + 1):
-            self.rig.hand.move((begin + (end - begin) * command / commands).tolist())
-            self.rig.run(self.physics.steps(1 / COMMANDS))
-        return self.rig.hand.lag < BLOCKED
+            self.scene.hand.move((begin + (end - begin) * command / commands).tolist())
+            self.scene.run(self.physics.steps(1 / COMMAND_RATE))
+        return self.scene.hand.lag < BLOCKED_LAG
 
     def _close(self, lift: Lift) -> None:
-        commands = max(1, round(self.execution.closing_time * COMMANDS))
+        commands = max(1, round(self.execution.closing_time * COMMAND_RATE))
         for command in range(1, commands + 1):
-            self.rig.hand.command(lift.pregrasp + (lift.grasp - lift.pregrasp) * command / commands)
-            self.rig.run(self.physics.steps(1 / COMMANDS))
+            self.scene.hand.command(lift.pregrasp + (lift.grasp - lift.pregrasp) * command / commands)
+            self.scene.run(self.physics.steps(1 / COMMAND_RATE))
 
     def _succeeded(self) -> bool:
-        pose, grip = self.rig.pose, self.rig.read_contacts()
+        pose, contacts = self.scene.pose, self.scene.read_contacts()
         cosine = min(1.0, abs(float(np.dot(pose.q, self.rest[1]))))
         up = float(pose.p[2] - self.rest[0][2]) > self.execution.lifted
-        return up and grip.held and bool(2 * np.arccos(cosine) < self.execution.turn)
+        return up and contacts.in_contact and bool(2 * np.arccos(cosine) < self.execution.turn)
 
 
 def rank(
@@ -155,19 +169,19 @@ def rank(
 ) -> Float[Tensor, " c"]:
     """Share of executed lifts that succeeded, per candidate.
 
-    A lift succeeds if at the end the object is `lifted` above its start, in contact with the hand, and has turned by
-    less than `turn`. The arm is left out: whether it reaches a candidate is for the motion-feasibility filter to say.
+    A lift succeeds if in the end the object is `lifted` above its start, in contact with the hand, and rotated by less
+    than `turn`. The arm is not simulated: whether it reaches a candidate is decided by the motion-feasibility filter.
 
     Args:
-        candidates: of this object and this robot.
-        obj: the object; it starts at rest on a table, as it is described.
-        robot: its hand is simulated on a carriage.
-        execution: how, and what is drawn.
-        purpose: which stream of draws: choose with "ranking", report with "reporting".
-        seed: of the draws; all candidates get the same draws.
-        physics: how finely.
+        candidates: c candidates of this object and this robot.
+        obj: the object, which starts at rest on a table.
+        robot: the robot whose hand is simulated on a carriage.
+        execution: numbers of the executions; the defaults if None.
+        purpose: random stream: "ranking" to choose candidates, "reporting" to report their rates.
+        seed: seed of the draws, which are the same for all candidates.
+        physics: resolution of the simulation; the default if None.
         processes: number of processes, one per core by default; 1 stays in this process.
-        progress: called with the number of executions done and of all.
+        progress: called with the number of executions done and their total.
 
     Raises:
         InputError: the candidates are of another object.
@@ -183,7 +197,7 @@ def rank(
 def lifts_of(
     candidates: GraspCandidates, obj: AffordanceObject, execution: Execution, random: np.random.Generator
 ) -> list[Lift]:
-    """All executions, candidate by candidate."""
+    """All `draws` executions of each of c candidates, candidate by candidate."""
     draws, count = execution.draws, len(candidates)
     factor = random.uniform(*execution.mass, draws)
     friction = random.uniform(*execution.friction, draws)

@@ -1,4 +1,4 @@
-"""The table of a grasp search, and the two files that it leaves."""
+"""The report of a grasp search: the printed table and the two files."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from dora.errors import InputError
 from dora.files import write_json
 
 SUFFIX = ".safetensors"
+"""Suffix of a file of candidates."""
 ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "candidates": lambda r: f"{r['optimised']} of {r['requested']}",
     "search": lambda r: f"{r['optimise_seconds']:.1f} s",
@@ -29,11 +30,11 @@ ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
         ", ".join(f"{n} {c} ({_percent(r['class_shares'][n])})" for n, c in r["classes"].items()) or "-"
     ),
 }
-"""Rows of the printed table, followed by the medians of the energy terms."""
+"""Functions that format each row of the printed table; the medians of the energy terms follow."""
 
 
 def print_report(report: dict[str, Any], console: Console | None = None) -> None:
-    """Print a summary and, beside it, those that it holds under "baselines" and "by_region"; below, the votes."""
+    """Print the table of a report, with a column per entry of "baselines" and "by_region", and the table of votes."""
     console = console or Console()
     beside = report.get("by_region", {}) | report.get("baselines", {})
     table = Table(title=f"{report['object']}, {report['region'] or 'any region'}, {report['robot']}")
@@ -54,7 +55,7 @@ def _energy(column: dict[str, Any], name: str) -> str:
 
 
 def _votes(voting: dict[str, Any]) -> Table:
-    """Recalls and confusion of the votes by the region that carries most force."""
+    """Balanced accuracy and confusion of the votes by the region of largest contact force."""
     labels = voting["labels"]
     table = Table(title="part that carries most force after closing, and what the contacts vote for")
     for heading in ("grasps", "contacts", "balanced accuracy", *(f"{name} held: voted" for name in labels)):
@@ -76,10 +77,10 @@ def _confused(row: list[int], names: list[str]) -> str:
 
 
 def check_out(out: Path) -> None:
-    """Make the folder of a file of grasps, so that bad paths are refused before the work.
+    """Create the folder of a file of candidates and check that it can be written, before the search begins.
 
     Raises:
-        InputError: it does not end in .safetensors, or it cannot be written.
+        InputError: the name does not end in .safetensors, or the file cannot be written.
     """
     if out.suffix != SUFFIX:
         raise InputError(f"--out is {out}: give a name that ends in {SUFFIX}.")
@@ -93,7 +94,11 @@ def check_out(out: Path) -> None:
 
 
 def write_report(report: dict[str, Any], candidates: GraspCandidates, out: Path) -> None:
-    """Write the candidates to `out` and the report beside it as .json, each atomically."""
+    """Write the candidates to `out` and the report beside it as .json, each atomically.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
     candidates.save(out)
     write_json(out.with_suffix(".json"), report)
 

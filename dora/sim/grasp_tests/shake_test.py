@@ -1,8 +1,8 @@
-"""Validation of grasp candidates by simulation: the hand closes, then gravity pulls in six directions in turn.
+"""Validation of grasp candidates by simulation: the hand closes, then gravity acts in six directions in turn.
 
-docs/validation.md says what is done and why; the numbers are in `dora.affordance.hand.protocol`. Candidates are shared
-out over processes. Each process simulates one after the other in a scene of its own, since a PhysX step of several
-hands takes as long as the steps of each; a candidate that fails makes room for the next at once.
+docs/validation.md describes the test; `dora.affordance.hand.grasp_test_settings` has its numbers. Candidates are
+distributed over processes. Each process simulates one candidate after the other in a scene of its own: a PhysX step of
+several hands takes as long as one step for each. A candidate that fails ends early.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.protocol import DIRECTIONS, STANDARD, Protocol
+from dora.affordance.hand.grasp_test_settings import DIRECTIONS, STANDARD, GraspTestSettings
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.search.cache import map_of
 from dora.errors import InputError
@@ -24,35 +24,36 @@ from dora.robot import RobotDescription
 from dora.sim.grasp_tests.hand_contacts import HandContacts
 from dora.sim.grasp_tests.test_scene import GraspTestScene, Physics
 
-LOOK = 0.05
-"""Time between measurements of the displacement [s]."""
-TOUCH = 0.25
-"""Time between readings of the contacts [s]; reading takes as long as a physics step."""
-THROWN = 0.05
-"""Shift by closing at which a test ends: there is nothing left to hold [m]."""
+DISPLACEMENT_INTERVAL = 0.05
+"""Time between two measurements of the displacement [s]."""
+CONTACT_INTERVAL = 0.25
+"""Time between two readings of the contacts, each of which takes as long as a physics step [s]."""
+THROWN_SHIFT = 0.05
+"""Displacement by closing at which a test ends, because the object is lost [m]."""
 
 
 class Reason(IntEnum):
-    """How a test ended."""
+    """How a grasp test ended."""
 
     PASSED = 0
+    """The hand held the object under all directions."""
     THROWN = 1
-    """Closing moved the object by 5 cm."""
+    """Closing moved the object by `THROWN_SHIFT` or more."""
     SLIPPED = 2
     """The object moved too far under gravity."""
     RELEASED = 3
-    """Nothing of the hand carried the object at the end of a direction."""
+    """No part of the hand carried a contact force at the end of a direction."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One candidate, hand at the world's origin: pose of the object in the hand's frame, commanded joints.
+    """One candidate with the wrist at the world's origin.
 
     Attributes:
-        position: (3,) [m].
-        quaternion: (4,) wxyz.
-        pregrasp: (20,) joints before closing [rad].
-        grasp: (20,) commanded joints of the squeezing hand [rad].
+        position: (3,) object in the wrist frame [m].
+        quaternion: (4,) object in the wrist frame, wxyz.
+        pregrasp: (20,) hand joints before closing [rad].
+        grasp: (20,) commanded hand joints of the squeezing hand [rad].
     """
 
     position: np.ndarray
@@ -63,7 +64,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Trial:
-    """What became of one candidate; as `Validation`, and the contacts after closing in the object frame."""
+    """Result of one candidate; fields as in `Validation`, and the contacts after closing in the object frame."""
 
     reason: Reason
     displacement: float
@@ -74,23 +75,23 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """Results of c candidates.
+    """Results of the grasp test for c candidates.
 
     Attributes:
-        reason: (c,) a `Reason` each.
-        displacement: (c,) farthest the centre of mass was from where closing left it [m].
-        closing_shift: (c,) how far closing moved the centre of mass [m].
-        penetration: (c,) deepest overlap of hand and object in the simulation, at readings from the end of closing
+        reason: (c,) how the test ended, a `Reason` each.
+        displacement: (c,) largest distance of the centre of mass from its place after closing [m].
+        closing_shift: (c,) displacement of the centre of mass by closing [m].
+        penetration: (c,) largest penetration depth of hand and object in the simulation, from the end of closing
             on [m].
-        part_force: (c, parts) contact force after closing on the palm and on each finger: magnitudes of the impulses
-            at the contact points over the time of the step, added up [N].
-        label_force: (c, labels) the same by the region of the object in which the contact points lie [N].
-        contacts: (c, k, 3) contact points that carry force after closing, in the object frame [m]; rows are filled up
+        part_force: (c, parts) contact force on palm and fingers after closing: sum over the contact points of the
+            impulse's magnitude divided by the duration of the step [N].
+        label_force: (c, labels) the same sums by the region of the object in which the contact points lie [N].
+        contacts: (c, k, 3) contact points that carry force after closing, in the object frame [m]; rows are padded
             with zeros.
-        contact_finger: (c, k) what presses there: 0 nothing, 1 palm, 2 thumb, ... 6 pinky.
-        candidate_penetration: (c,) overlap of hand and object at the candidate, from the candidates [m].
-        self_penetration: (c,) overlap of the hand with itself at the candidate, from the candidates [m].
-        protocol: what was done.
+        contact_finger: (c, k) their contact classes: 0 no contact, 1 palm, 2 thumb, ... 6 pinky.
+        candidate_penetration: (c,) penetration depth of hand and object at the candidate, by geometry [m].
+        self_penetration: (c,) penetration depth between links of the hand at the candidate, by geometry [m].
+        test_settings: settings of the test.
     """
 
     reason: Int[Tensor, " c"]
@@ -103,93 +104,95 @@ class Validation:
     contact_finger: Int[Tensor, "c k"]
     candidate_penetration: Float[Tensor, " c"]
     self_penetration: Float[Tensor, " c"]
-    protocol: Protocol
+    test_settings: GraspTestSettings
 
     @property
     def passed(self) -> Bool[Tensor, " c"]:
-        """Whether the simulated hand held the object."""
+        """(c,) whether the simulated hand held the object under all directions."""
         return self.reason == Reason.PASSED
 
     @property
     def valid(self) -> Bool[Tensor, " c"]:
-        """Passed, with no more overlap at the candidate than the protocol allows."""
-        return self.passed & (self.candidate_penetration <= self.protocol.penetration)
+        """(c,) passed, and within the test's limit of the penetration depth at the candidate."""
+        return self.passed & (self.candidate_penetration <= self.test_settings.penetration)
 
     @property
     def strict(self) -> Bool[Tensor, " c"]:
-        """Valid, with no more self-penetration and no more shift by closing than the protocol's strict limits."""
-        tidy = self.self_penetration < self.protocol.strict_self_penetration
-        return self.valid & tidy & (self.closing_shift < self.protocol.strict_shift)
+        """(c,) valid, and within the strict limits of self-penetration and of the displacement by closing."""
+        tidy = self.self_penetration < self.test_settings.strict_self_penetration
+        return self.valid & tidy & (self.closing_shift < self.test_settings.strict_shift)
 
     @property
     def touched(self) -> Bool[Tensor, "c parts"]:
-        """Which of palm and fingers carried force after closing."""
+        """(c, parts) whether palm and fingers carried force after closing."""
         return self.part_force > 0
 
     @property
-    def held(self) -> Int[Tensor, " c"]:
-        """Index of the region that carried most force after closing; -1 if none did."""
+    def dominant_region(self) -> Int[Tensor, " c"]:
+        """(c,) index of the region with the largest contact force after closing; -1 without force."""
         return torch.where(self.label_force.sum(1) > 0, self.label_force.argmax(1), -1)
 
 
 class ShakeTest:
-    """Simulates one candidate after the other; arguments as of `validate`."""
+    """Simulates candidates one after the other in one scene; arguments as for `validate`."""
 
-    def __init__(self, obj: AffordanceObject, robot: RobotDescription, protocol: Protocol, physics: Physics):
-        self.protocol, self.physics = protocol, physics
-        self.weight = obj.mass * protocol.gravity
-        self.rig = GraspTestScene(obj, robot, protocol.friction, physics)
+    def __init__(
+        self, obj: AffordanceObject, robot: RobotDescription, test_settings: GraspTestSettings, physics: Physics
+    ):
+        self.test_settings, self.physics = test_settings, physics
+        self.weight = obj.mass * test_settings.gravity
+        self.scene = GraspTestScene(obj, robot, test_settings.friction, physics)
 
     def __call__(self, case: Case) -> Trial:
-        """Closes the hand and, if the object is still there, tries all directions."""
-        self.rig.place(case.position, case.quaternion)
-        self.rig.hand.reset(case.pregrasp)
+        """Closes the hand and, unless the object was thrown, applies gravity along all directions."""
+        self.scene.place(case.position, case.quaternion)
+        self.scene.hand.reset(case.pregrasp)
         shift = self._close(case)
-        if not shift < THROWN:
+        if not shift < THROWN_SHIFT:
             return Trial(Reason.THROWN, 0.0, shift, 0.0, None)
-        touch = self.rig.read_contacts()
+        touch = self.scene.read_contacts()
         reason, displacement, depth = self._shake(case)
         return Trial(reason, displacement, shift, max(touch.depth, depth), touch.in_frame(self.start))
 
     def _close(self, case: Case) -> float:
-        """The hand moves from its opened to its squeezing posture; returns the object's shift [m]."""
-        rig, protocol = self.rig, self.protocol
-        steps, look = self.physics.steps(protocol.closing_time), self.physics.steps(LOOK)
-        moving = max(1, round(protocol.ramp * steps))
+        """Moves the command from the opened to the squeezing posture; returns the object's displacement [m]."""
+        scene, test_settings = self.scene, self.test_settings
+        steps, look = self.physics.steps(test_settings.closing_time), self.physics.steps(DISPLACEMENT_INTERVAL)
+        moving = max(1, round(test_settings.ramp * steps))
         shift, change = 0.0, case.grasp - case.pregrasp
-        rig.damp(protocol.closing_damping)
+        scene.damp(test_settings.closing_damping)
         for step in range(1, steps + 1):
             if step <= moving:
-                rig.hand.command(case.pregrasp + step / moving * change)
-            rig.step()
+                scene.hand.command(case.pregrasp + step / moving * change)
+            scene.step()
             if step % look == 0 or step == steps:
-                shift = float(np.linalg.norm(rig.position - case.position))
-                if not shift < THROWN:
+                shift = float(np.linalg.norm(scene.position - case.position))
+                if not shift < THROWN_SHIFT:
                     break
-        rig.damp(0.0)
-        self.start = rig.pose
+        scene.damp(0.0)
+        self.start = scene.pose
         return shift
 
     def _shake(self, case: Case) -> tuple[Reason, float, float]:
-        """Gravity along all directions: how it ended, displacement and penetration [m]."""
-        rig, physics = self.rig, self.physics
+        """Applies gravity along all directions; returns how it ended, displacement and penetration depth [m]."""
+        scene, physics = self.scene, self.physics
         turn = matrix_from_quaternion(torch.tensor(case.quaternion)).numpy()
         origin, farthest, depth = self.start.p, 0.0, 0.0
-        push, step = rig.push, rig.step
-        looks = max(1, round(self.protocol.duration / LOOK))
+        push, step = scene.push, scene.step
+        looks = max(1, round(self.test_settings.duration / DISPLACEMENT_INTERVAL))
         for direction in DIRECTIONS:
             force = (turn @ np.array(direction) * self.weight).astype(np.float32)
             for look in range(1, looks + 1):
-                for _ in range(physics.steps(self.protocol.duration / looks)):
+                for _ in range(physics.steps(self.test_settings.duration / looks)):
                     push(force)
                     step()
-                farthest = max(farthest, float(np.linalg.norm(rig.position - origin)))
-                if not farthest <= self.protocol.displacement:
+                farthest = max(farthest, float(np.linalg.norm(scene.position - origin)))
+                if not farthest <= self.test_settings.displacement:
                     return Reason.SLIPPED, farthest, depth
-                if look % round(TOUCH / LOOK) == 0 or look == looks:
-                    touch = rig.read_contacts()
+                if look % round(CONTACT_INTERVAL / DISPLACEMENT_INTERVAL) == 0 or look == looks:
+                    touch = scene.read_contacts()
                     depth = max(depth, touch.depth)
-            if not touch.held:
+            if not touch.in_contact:
                 return Reason.RELEASED, farthest, depth
         return Reason.PASSED, farthest, depth
 
@@ -198,31 +201,33 @@ def validate(
     candidates: GraspCandidates,
     obj: AffordanceObject,
     robot: RobotDescription,
-    protocol: Protocol = STANDARD,
+    test_settings: GraspTestSettings = STANDARD,
     physics: Physics | None = None,
     processes: int | None = None,
     progress: Progress | None = None,
 ) -> Validation:
     """Tests every candidate in SAPIEN.
 
-    Equal candidates give equal results but for rare borderline cases: PhysX remembers contacts of the grasp before,
-    which changes the last bits.
+    Equal candidates give equal results except in rare borderline cases: PhysX keeps contacts of the grasp before, which
+    changes the last bits.
 
     Args:
-        candidates: of this object and this robot.
+        candidates: c candidates of this object and this robot.
         obj: the object.
-        robot: its hand is simulated with the palm held still, without the arm.
-        protocol: what is done.
-        physics: how finely.
+        robot: the robot whose hand is simulated with a fixed palm, without the arm.
+        test_settings: settings of the test.
+        physics: resolution of the simulation; the default if None.
         processes: number of processes, one per core by default; 1 stays in this process.
-        progress: called with the number of candidates done and of all.
+        progress: called with the number of candidates done and their total.
 
     Raises:
         InputError: the candidates are of another object.
         RuntimeError: a simulating process died.
     """
     check_object(candidates, obj)
-    trials = run_cases(ShakeTest, (obj, robot, protocol, physics or Physics()), _cases(candidates), processes, progress)
+    trials = run_cases(
+        ShakeTest, (obj, robot, test_settings, physics or Physics()), _cases(candidates), processes, progress
+    )
     parts = 1 + len(robot.fingers)
     contacts = [trial.touch for trial in trials]
     points, finger = _pressed(contacts)
@@ -238,18 +243,22 @@ def validate(
         contact_finger=finger,
         candidate_penetration=candidates.penetration.cpu(),
         self_penetration=candidates.self_penetration.cpu(),
-        protocol=protocol,
+        test_settings=test_settings,
     )
 
 
 def check_object(candidates: GraspCandidates, obj: AffordanceObject) -> None:
-    """Raises InputError if the candidates are known to be of another object."""
+    """Check that candidates are not known to be of another object.
+
+    Raises:
+        InputError: they are.
+    """
     if candidates.object != obj.name or candidates.digest not in ("", obj.digest):
         raise InputError(f"the candidates are of another {candidates.object!r} than {obj.name!r}; generate new ones.")
 
 
 def _cases(candidates: GraspCandidates) -> list[Case]:
-    """The object as the hand sees it: the inverse of the wrist's pose in the object frame."""
+    """Cases of all candidates: the object's pose in the wrist frame inverts the wrist's pose in the object frame."""
     turn = quaternion_inverse(candidates.quaternion)
     fields = quaternion_apply(turn, -candidates.position), turn, candidates.pregrasp, candidates.grasp
     return [Case(*row) for row in zip(*(field.cpu().numpy() for field in fields), strict=True)]
@@ -260,7 +269,7 @@ def _part_force(touch: HandContacts | None, parts: int) -> np.ndarray:
 
 
 def _pressed(contacts: list[HandContacts | None]) -> tuple[Float[Tensor, "c k 3"], Int[Tensor, "c k"]]:
-    """Points that carry force and their contact classes, filled up to the largest number of them."""
+    """Contact points that carry force and their contact classes, padded to the largest number of them."""
     pressing = [np.zeros(0, np.int64) if touch is None else np.flatnonzero(touch.force > 0) for touch in contacts]
     most = max(map(len, pressing))
     points, finger = torch.zeros(len(contacts), most, 3), torch.zeros(len(contacts), most, dtype=torch.long)
@@ -272,7 +281,7 @@ def _pressed(contacts: list[HandContacts | None]) -> tuple[Float[Tensor, "c k 3"
 
 
 def _label_force(contacts: list[HandContacts | None], obj: AffordanceObject) -> Float[Tensor, "c labels"]:
-    """Force by the region of the surface point nearest to each contact point, all candidates at once."""
+    """Force by region [N]; a contact point belongs to the region of the surface point nearest to it."""
     found = torch.zeros(len(contacts), len(obj.labels))
     known = [(row, touch) for row, touch in enumerate(contacts) if touch is not None and len(touch.part)]
     if known:

@@ -1,4 +1,4 @@
-"""A test rig: one object and a hand without an arm, alone in a scene."""
+"""The scene of grasp tests: one object, a hand without an arm, and optionally a table."""
 
 from collections.abc import Sequence
 from contextlib import contextmanager
@@ -17,21 +17,25 @@ from dora.sim.grasp_tests.floating_hand import FloatingHand
 from dora.sim.grasp_tests.hand_contacts import HandContactReader
 
 TABLE_HALF = (1.0, 1.0, 0.05)
-"""Half extents of the table [m]; its upper face is z = 0."""
+"""Half sides of the table along x, y, z [m]; its upper face is at z = 0."""
 ANGULAR_DAMPING = 0.05
 """PhysX's default damping of rotation [1/s]."""
 _ZERO = np.zeros(3, np.float32)
+"""No velocity or torque."""
 
 
 @dataclass(frozen=True)
 class Physics:
-    """How finely a rig is simulated.
+    """Resolution of the simulation of a test scene.
 
     Attributes:
         rate: physics steps per second [1/s].
-        position_iterations: of the solver (TGS), per step.
-        velocity_iterations: of the solver, per step.
-        contact_offset: distance at which contacts with the object begin to be looked for [m].
+        position_iterations: number of position iterations of the solver (TGS) per step.
+        velocity_iterations: number of velocity iterations of the solver per step.
+        contact_offset: PhysX's contact offset of the object, the distance below which contacts are generated [m].
+
+    Raises:
+        InputError: a number is not positive.
     """
 
     rate: float = 200.0
@@ -44,13 +48,13 @@ class Physics:
             raise InputError("the physics rate and iterations must be positive; correct them.")
 
     def steps(self, duration: float) -> int:
-        """Physics steps in a time [s]; at least 1."""
+        """Number of physics steps in a duration [s], at least 1."""
         return max(1, round(duration * self.rate))
 
 
 @contextmanager
 def _gravity(gravity: Sequence[float]):
-    """SAPIEN gives a new physics system the global scene settings: change them for a moment."""
+    """Changes SAPIEN's global scene settings, which a new physics system copies, and restores them afterwards."""
     before = physx.get_scene_config()
     kept = (before.gravity.copy(), before.enable_tgs)
     settings: dict[str, Any] = {"gravity": np.array(gravity, np.float32), "enable_tgs": True}
@@ -66,17 +70,18 @@ class GraspTestScene:
 
     Args:
         obj: the object.
-        robot: whose hand it is.
-        friction: coefficient of hand and object.
-        physics: how finely.
-        gravity: acceleration (3,) [m/s^2]; the hand is weightless in any case.
-        carriage: whether the palm can be moved (`FloatingHand`).
-        table: whether there is a table under z = 0.
+        robot: the robot whose hand is simulated.
+        friction: Coulomb coefficient of hand and object [1].
+        physics: resolution of the simulation.
+        gravity: (3,) acceleration of the object in the world [m/s^2]; the hand is weightless.
+        carriage: whether the palm is mounted on a carriage, see `FloatingHand`.
+        table: whether there is a table below z = 0.
 
     Attributes:
         hand: the hand.
         body: the object's body.
-        step: makes one physics step.
+        step: function that makes one physics step.
+        read_contacts: function that returns the contacts of hand and object in the last step.
     """
 
     def __init__(
@@ -120,13 +125,13 @@ class GraspTestScene:
         self._scene.add_entity(entity)
 
     def place(self, position: np.ndarray, quaternion: np.ndarray) -> None:
-        """Puts the object at rest, origin (3,) [m] and orientation wxyz (4,) in the world."""
+        """Places the object at rest, with its origin (3,) [m] and orientation (4,) wxyz in the world."""
         self._entity.set_pose(sapien.Pose(position.tolist(), quaternion.tolist()))
         self.body.set_linear_velocity(_ZERO)
         self.body.set_angular_velocity(_ZERO)
 
     def stage(self, position: np.ndarray, quaternion: np.ndarray, mass: float, friction: float) -> None:
-        """Puts the object at rest and gives it a mass [kg] and, with the hand, a coefficient of friction."""
+        """Places the object at rest and sets its mass [kg] and the friction coefficient of all bodies [1]."""
         self.place(position, quaternion)
         self.body.set_mass(mass)
         self.body.set_inertia(self._inertia * (mass / self._mass))
@@ -135,17 +140,17 @@ class GraspTestScene:
             material.dynamic_friction = friction
 
     def run(self, steps: int) -> None:
-        """Makes physics steps."""
+        """Makes a number of physics steps."""
         for _ in range(steps):
             self.step()
 
     def damp(self, rate: float) -> None:
-        """Lets the object's velocities decay at a rate [1/s]; 0 is free motion."""
+        """Sets the rate at which the object's velocities decay [1/s]; 0 restores PhysX's default."""
         self.body.set_linear_damping(rate)
         self.body.set_angular_damping(max(rate, ANGULAR_DAMPING))
 
     def push(self, force: np.ndarray) -> None:
-        """A force (3,) [N] on the centre of mass during the next physics step."""
+        """Applies a force (3,) [N] at the centre of mass during the next physics step."""
         self.body.add_force_torque(force, _ZERO)
 
     @property
@@ -155,5 +160,5 @@ class GraspTestScene:
 
     @property
     def pose(self) -> sapien.Pose:
-        """The object's pose in the world."""
+        """The object's pose in the world [m]."""
         return self._entity.pose

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.protocol import flexion
+from dora.affordance.hand.postures import flexion
 from dora.geometry.poses import carried
 from dora.geometry.rotations import quaternion_apply, rotation_angle
 from dora.robot import RobotDescription

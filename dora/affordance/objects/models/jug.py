@@ -41,7 +41,7 @@ SPOUT_REACH, SPOUT_RISE = 0.26, 0.003
 """How far the lip is pulled out, as a share of the radius, and up."""
 SPOUT_BOTTOM = 0.120
 SPOUT_WIDTH = 0.36
-"""Standard deviation (rad) of the pulled lip about -x."""
+"""Standard deviation [rad] of the pulled lip about -x."""
 HANDLE_RADIUS = 0.009
 HANDLE_FLARE = 1.18
 """Growth of the handle's radius where it meets the body."""

@@ -1,7 +1,7 @@
-"""The closing hand in compiled loops: one step of descent towards equilibrium, and the sequence of closing and loading.
+"""Quasi-static closing in compiled loops: steps of descent towards equilibrium while the hand closes and is loaded.
 
-`dora.affordance.search.quasi_static_closing` says what is modelled. What moves is the wrist in the object frame: the
-object seen from the hand.
+`dora.affordance.search.quasi_static_closing` describes the model. The object is fixed and the wrist moves in the
+object frame; only their relative motion matters.
 """
 
 import math
@@ -10,26 +10,34 @@ from typing import NamedTuple
 import numpy as np
 
 from dora.affordance.search.native.compiling import native
-from dora.affordance.search.native.contact import STIFFNESS, Contacts, rest_on, touch
+from dora.affordance.search.native.contact import STIFFNESS, Contacts, object_contacts, table_contacts
 from dora.affordance.search.native.field import FieldArrays
-from dora.affordance.search.native.hand import HandArrays, cross, forward, pull_back, push, self_penetration, turn
+from dora.affordance.search.native.hand import (
+    HandArrays,
+    add_force,
+    cross,
+    forward,
+    pull_back,
+    rotate,
+    self_penetration,
+)
 
 MOMENTUM = 0.7
-"""Share of the last step that is added to the next one."""
+"""Share of the last step that is added to the next one [1]."""
 LARGEST_STEP = 3e-3
-"""Largest step of the object (m, and in units of `ARM` rad)."""
+"""Largest step of the wrist's pose [m]; a rotation counts `LEVER` m per rad."""
 LARGEST_TURN = 0.05
-"""Largest step of a joint (rad)."""
-ARM = 0.04
-"""Typical distance (m) of contacts from the middle of the grip."""
-SPARE = 5.0
-"""Contacts on whose stiffness the step sizes count in addition to those that exist."""
-LOST = 0.06
-"""Displacement (m) at which a grasp is given up."""
+"""Largest step of a joint's angle [rad]."""
+LEVER = 0.04
+"""Typical distance of contacts from the centre of the grasp, which scales rotations [m]."""
+EXTRA_CONTACTS = 5.0
+"""Number added to the contacts when step sizes are derived from their total stiffness [1]."""
+GIVEN_UP_DISPLACEMENT = 0.06
+"""Displacement at which the loading of a candidate ends early [m]."""
 
 
 class Drives(NamedTuple):
-    """Of all joints: stiffness (N m/rad), effort (N m), and the step per torque (rad/N m)."""
+    """Drives of all joints: stiffness [N m/rad], largest torque [N m], step of descent per torque [rad/(N m)]."""
 
     stiffness: np.ndarray
     effort: np.ndarray
@@ -37,25 +45,30 @@ class Drives(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Steps of descent: while the command moves, until the grip rests, and for every direction of the weight."""
+    """Numbers of steps of descent: while the command moves, then at rest, and under each direction of the weight."""
 
     closing: int = 60
     settling: int = 20
     weight: int = 20
 
 
-class Ranking(NamedTuple):
-    """Quality of a candidate, log(1 + force/N) less (displacement + `shift_share` shift) / `much` (m), and how many of
-    the best are `wanted`: the others are given up as soon as it is certain that they are not among them."""
+class QualitySettings(NamedTuple):
+    """How candidates are compared: log(1 + force/N) - (displacement + `shift_share` shift) / `displacement_scale` [m].
 
-    much: float
+    The `wanted` best are looked for; the loading of a candidate ends as soon as it cannot be among them.
+    """
+
+    displacement_scale: float
     shift_share: float
     wanted: int
 
 
 class Model(NamedTuple):
-    """What is the same for all candidates: hand, distance field, drives, middle of the grip in the wrist's frame (m),
-    friction, and normal and offset (m) of the table (infinitely far if there is none)."""
+    """What all candidates share: hand, distance field of the object, drives, friction and table.
+
+    `center` (3,) is the centre of the grasp in the wrist frame [m]; `friction` is Coulomb's coefficient [1]; `plane`
+    (4,) is the table's normal and offset [m], with an infinite offset if there is no table.
+    """
 
     hand: HandArrays
     field: FieldArrays
@@ -66,8 +79,11 @@ class Model(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Of one candidate: pose of the wrist, joints, their command (rad), force of the weight on the wrist (N), the last
-    step, and the contacts with the object."""
+    """State of one candidate.
+
+    `wrist` (4, 4) pose in the object frame, `joints` and `command` (j,) [rad], `weight` (3,) force on the wrist [N],
+    `speed` (6 + j,) last step of wrist [m], [rad] and joints [rad], and the contacts with the object.
+    """
 
     wrist: np.ndarray
     joints: np.ndarray
@@ -77,8 +93,8 @@ class _State(NamedTuple):
     contacts: Contacts
 
 
-class _Scratch(NamedTuple):
-    """Room for intermediate results of a step."""
+class _Workspace(NamedTuple):
+    """Arrays for intermediate results of a step, allocated once."""
 
     angles: np.ndarray
     poses: np.ndarray
@@ -88,43 +104,43 @@ class _Scratch(NamedTuple):
 
 
 @native
-def close_and_load(model, steps, ranking, load, directions, wrists, opened, squeezed):
-    """Closes every hand from `opened` to `squeezed` (c, j), then lets a weight act along each direction in turn.
+def close_and_load(model, steps, quality, load, directions, wrists, opened, squeezed):
+    """Closes every hand from `opened` to `squeezed`, then applies a weight along each direction in turn.
 
     Args:
         model: a `Model`.
         steps: a `Steps`.
-        ranking: a `Ranking`.
-        load: the weight (N).
-        directions: (d, 3) of the weight in the object frame.
-        wrists: (c, 4, 4) poses in the object frame; after closing on return.
-        opened: (c, j) all joints (rad), in the order of the model; after closing on return.
-        squeezed: (c, j) command (rad).
+        quality: a `QualitySettings`.
+        load: the weight [N].
+        directions: (d, 3) unit directions of the weight in the object frame.
+        wrists: (c, 4, 4) wrist poses in the object frame; overwritten by those after closing.
+        opened: (c, j) all joints in the order of the model [rad]; overwritten by those after closing.
+        squeezed: (c, j) command of all joints [rad].
 
     Returns:
-        (c, 2 + d): shift of the object by closing (m), sum of normal forces (N), and the farthest it has been from
-        there up to each direction (m), up to when it was given up.
+        (c, 2 + d): displacement of the object by closing [m], sum of normal forces after closing [N], and the largest
+        displacement from there up to each direction [m], until the loading ended.
     """
     count, joints = opened.shape
-    result, best = np.zeros((count, 2 + len(directions))), np.full(ranking.wanted, -np.inf)
-    state, scratch = _room(len(model.hand.sphere_body), joints, len(model.hand.ends))
+    result, best = np.zeros((count, 2 + len(directions))), np.full(quality.wanted, -np.inf)
+    state, workspace = _make_workspace(len(model.hand.sphere_body), joints, len(model.hand.ends))
     for row in range(count):
         start = wrists[row].copy()
         _begin(state, start, opened[row])
-        force = _close(model, steps, opened[row].copy(), squeezed[row], state, scratch)
+        force = _close(model, steps, opened[row].copy(), squeezed[row], state, workspace)
         wrists[row, :, :], opened[row, :] = state.wrist, state.joints
-        shift = _moved(state.wrist, start)
+        shift = _displacement(state.wrist, start)
         result[row, 0], result[row, 1] = shift, force
-        unmoved = math.log1p(force) - ranking.shift_share * shift / ranking.much
-        limit = min(LOST, (unmoved - best[0]) * ranking.much)
-        far = _load(model, steps.weight, load, directions, start, wrists[row], limit, state, scratch, result[row, 2:])
-        _insert(best, unmoved - far / ranking.much)
+        unmoved = math.log1p(force) - quality.shift_share * shift / quality.displacement_scale
+        limit = min(GIVEN_UP_DISPLACEMENT, (unmoved - best[0]) * quality.displacement_scale)
+        far = _load(model, steps.weight, load, directions, start, wrists[row], limit, state, workspace, result[row, 2:])
+        _insert(best, unmoved - far / quality.displacement_scale)
     return result
 
 
 @native
 def _insert(best, quality):
-    """Puts a quality into the ascending list of the best ones, whose first leaves."""
+    """Inserts a quality into the ascending array of the best ones, if it is better than the first, which drops out."""
     if quality > best[0]:
         place = 1
         while place < len(best) and best[place] < quality:
@@ -134,8 +150,8 @@ def _insert(best, quality):
 
 
 @native
-def _room(spheres, joints, ends):
-    """State and scratch of a hand."""
+def _make_workspace(spheres, joints, ends):
+    """State and workspace for a hand with these numbers of spheres, joints and ends of capsules."""
     state = _State(
         np.zeros((4, 4)),
         np.zeros(joints),
@@ -147,19 +163,19 @@ def _room(spheres, joints, ends):
         ),
     )
     bodies = joints + 1
-    scratch = _Scratch(
+    workspace = _Workspace(
         np.zeros(joints),
         np.zeros((bodies, 3, 4)),
         np.zeros((bodies, 6)),
         np.zeros(6 + joints),
         np.zeros((ends, 3)),
     )
-    return state, scratch
+    return state, workspace
 
 
 @native
 def _begin(state, wrist, opened):
-    """An open hand at rest that touches nothing."""
+    """Sets the state to an open hand at rest without contacts."""
     state.wrist[:] = wrist
     state.joints[:] = opened
     state.command[:] = opened
@@ -170,21 +186,23 @@ def _begin(state, wrist, opened):
 
 
 @native
-def _close(model, steps, opened, squeezed, state, scratch):
-    """Moves the command from open to squeezed and settles; returns the sum of normal forces (N)."""
+def _close(model, steps, opened, squeezed, state, workspace):
+    """Moves the command from open to squeezed, then holds it constant; returns the sum of normal forces [N]."""
     force = 0.0
     for step in range(steps.closing + steps.settling):
         share = min(1.0, (step + 1) / steps.closing)
         for j in range(len(opened)):
             state.command[j] = opened[j] + share * (squeezed[j] - opened[j])
-        force = _relax(model, state, scratch)
+        force = _descent_step(model, state, workspace)
     return force
 
 
 @native
-def _load(model, steps, load, directions, start, settled, limit, state, scratch, farthest):
-    """The weight along each direction in turn, until the object is `limit` (m) from the settled place; `farthest` (d,)
-    gets the farthest it has been (m), which is returned, too."""
+def _load(model, steps, load, directions, start, settled, limit, state, workspace, farthest):
+    """Applies the weight along each direction until the displacement from the pose `settled` exceeds `limit` [m].
+
+    Writes the largest displacement up to each direction to `farthest` (d,) [m] and returns the last.
+    """
     far = 0.0
     for d in range(len(directions)):
         for _ in range(steps):
@@ -194,15 +212,15 @@ def _load(model, steps, load, directions, start, settled, limit, state, scratch,
                     for k in range(3):
                         for m in range(3):
                             state.weight[i] += load * state.wrist[i, k] * start[m, k] * directions[d, m]
-                _relax(model, state, scratch)
-                far = max(far, _moved(state.wrist, settled))
+                _descent_step(model, state, workspace)
+                far = max(far, _displacement(state.wrist, settled))
         farthest[d] = far
     return far
 
 
 @native
-def _moved(wrist, other):
-    """Distance (m) of the object's origin between two poses of the wrist, seen from the wrist."""
+def _displacement(wrist, other):
+    """Displacement of the object's origin in the wrist frame between two poses of the wrist [m]."""
     square = 0.0
     for i in range(3):
         square += (_origin(wrist, i) - _origin(other, i)) ** 2
@@ -211,23 +229,23 @@ def _moved(wrist, other):
 
 @native
 def _origin(wrist, axis):
-    """Position (m) of the object's origin in the wrist's frame, along one axis."""
+    """Component of the object's origin along one axis of the wrist frame [m]."""
     return -(wrist[0, axis] * wrist[0, 3] + wrist[1, axis] * wrist[1, 3] + wrist[2, axis] * wrist[2, 3])
 
 
 @native
-def _relax(model, state, scratch):
-    """One step of descent of all forces; returns the sum of normal forces (N)."""
+def _descent_step(model, state, workspace):
+    """One step of wrist and joints along the generalised forces; returns the sum of normal forces [N]."""
     hand, drives, joints, command, speed = model.hand, model.drives, state.joints, state.command, state.speed
-    poses, wrench, gradient = scratch.poses, scratch.wrench, scratch.gradient
-    forward(hand, state.wrist, joints, 0.0, scratch.angles, poses)
+    poses, wrench, gradient = workspace.poses, workspace.wrench, workspace.gradient
+    forward(hand, state.wrist, joints, 0.0, workspace.angles, poses)
     wrench[:] = 0.0
     gradient[:] = 0.0
     if model.plane[3] < np.inf:
-        rest_on(hand.sphere_body, hand.sphere_local, hand.sphere_radius, model.plane, poses, wrench)
-    total, contacts = touch(hand, model.field, model.friction, state.contacts, poses, wrench)
-    self_penetration(hand, 0.0, STIFFNESS, poses, scratch.ends, wrench)
-    push(wrench, 0, (0.0, 0.0, 0.0), state.weight)
+        table_contacts(hand.sphere_body, hand.sphere_local, hand.sphere_radius, model.plane, poses, wrench)
+    total, contacts = object_contacts(hand, model.field, model.friction, state.contacts, poses, wrench)
+    self_penetration(hand, 0.0, STIFFNESS, poses, workspace.ends, wrench)
+    add_force(wrench, 0, (0.0, 0.0, 0.0), state.weight)
     pull_back(hand, poses, wrench, gradient)
     for j in range(len(joints)):
         torque = drives.stiffness[j] * (joints[j] - command[j])
@@ -235,13 +253,13 @@ def _relax(model, state, scratch):
         speed[6 + j] = MOMENTUM * speed[6 + j] - (gradient[6 + j] + torque) * drives.step[j]
         step = min(max(speed[6 + j], -LARGEST_TURN), LARGEST_TURN)
         joints[j] = min(max(joints[j] + step, hand.lower[j]), hand.upper[j])
-    _move(state.wrist, model.center, (SPARE + contacts) * STIFFNESS, gradient, speed)
+    _move(state.wrist, model.center, (EXTRA_CONTACTS + contacts) * STIFFNESS, gradient, speed)
     return total
 
 
 @native
 def _move(wrist, center, stiffness, gradient, speed):
-    """Moves the wrist, which is the object seen from the hand, by a step about the middle of the grip."""
+    """Moves the wrist by one step of descent; its rotation is about the centre of the grasp."""
     arm = (
         -(wrist[0, 0] * center[0] + wrist[0, 1] * center[1] + wrist[0, 2] * center[2]),
         -(wrist[1, 0] * center[0] + wrist[1, 1] * center[1] + wrist[1, 2] * center[2]),
@@ -251,11 +269,11 @@ def _move(wrist, center, stiffness, gradient, speed):
     size = 0.0
     for i in range(3):
         speed[i] = MOMENTUM * speed[i] - gradient[i] / stiffness
-        speed[3 + i] = MOMENTUM * speed[3 + i] - (gradient[3 + i] + lever[i]) / (stiffness * ARM**2)
-        size = max(size, abs(speed[i]), ARM * abs(speed[3 + i]))
+        speed[3 + i] = MOMENTUM * speed[3 + i] - (gradient[3 + i] + lever[i]) / (stiffness * LEVER**2)
+        size = max(size, abs(speed[i]), LEVER * abs(speed[3 + i]))
     if size > LARGEST_STEP:
         for i in range(6):
             speed[i] *= LARGEST_STEP / size
-    turn(wrist, arm, (speed[3], speed[4], speed[5]))
+    rotate(wrist, arm, (speed[3], speed[4], speed[5]))
     for i in range(3):
         wrist[i, 3] += speed[i]

@@ -1,4 +1,4 @@
-"""How functions are compiled."""
+"""Decorators that compile functions by Numba, kept on disk."""
 
 import inspect
 from collections.abc import Callable
@@ -6,14 +6,14 @@ from collections.abc import Callable
 from numba import njit
 
 RELAXED = {"contract", "reassoc", "nsz", "arcp"}
-"""Liberties with rounding; infinities keep their meaning."""
+"""Numba's fast-math flags: operations may be reordered and fused; infinities and NaN keep their meaning."""
 
 
 def native(function: Callable) -> Callable:
-    """A function compiled by Numba, kept on disk; type checks that were put around it are left out."""
+    """A function compiled by Numba and cached on disk; decorators that check types are removed first."""
     return njit(cache=True, error_model="numpy", fastmath=RELAXED)(inspect.unwrap(function))
 
 
 def inlined(function: Callable) -> Callable:
-    """As `native`, for small functions in inner loops: compiled into those that call them."""
+    """As `native`, for small functions in inner loops: inlined into their callers."""
     return njit(cache=True, error_model="numpy", fastmath=RELAXED, forceinline=True)(inspect.unwrap(function))

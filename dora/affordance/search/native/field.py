@@ -1,4 +1,4 @@
-"""The signed distance of one point."""
+"""Signed distance of one point in compiled loops: nearest node, and trilinear interpolation."""
 
 import math
 from typing import NamedTuple
@@ -10,7 +10,11 @@ from dora.affordance.search.native.compiling import inlined, native
 
 
 class FieldArrays(NamedTuple):
-    """Arrays of `SignedDistanceField`: all channels, distance, nodes per axis, first node, nodes per m, cull (m)."""
+    """Arrays of a `SignedDistanceField`.
+
+    `table` (nodes, channels), `distance` (nodes,) [m], `shape` nodes per axis, `lower` position of the first node [m],
+    `inverse` of the spacing [1/m], `cull` largest difference between interpolated and nearest-node distance [m].
+    """
 
     table: np.ndarray
     distance: np.ndarray
@@ -27,8 +31,8 @@ def _nearest(position, lower, inverse, count):
 
 
 @inlined
-def coarse(field, point):
-    """Distance (m) at the node nearest to a point."""
+def nearest_node_distance(field, point):
+    """Distance at the node nearest to a point [m]."""
     i = _nearest(point[0], field.lower[0], field.inverse, field.shape[0])
     j = _nearest(point[1], field.lower[1], field.inverse, field.shape[1])
     k = _nearest(point[2], field.lower[2], field.inverse, field.shape[2])
@@ -36,8 +40,8 @@ def coarse(field, point):
 
 
 @inlined
-def _along(position, lower, inverse, count):
-    """Along one axis: first node of the cell, share of the cell passed, distance (m) beyond the grid."""
+def _cell(position, lower, inverse, count):
+    """Along one axis: first node of the cell, relative position in the cell [1], distance beyond the grid [m]."""
     place = (position - lower) * inverse
     inside = min(max(place, 0.0), count - 1.0)
     base = min(int(inside), count - 2)
@@ -46,10 +50,10 @@ def _along(position, lower, inverse, count):
 
 @native
 def sample(field, table, point, value, slope):
-    """As `SignedDistanceField.sample`: interpolated channels of a table and their derivatives (per m)."""
-    i, x, outside_x = _along(point[0], field.lower[0], field.inverse, field.shape[0])
-    j, y, outside_y = _along(point[1], field.lower[1], field.inverse, field.shape[1])
-    k, z, outside_z = _along(point[2], field.lower[2], field.inverse, field.shape[2])
+    """Writes the interpolated channels and their derivatives [1/m], as `SignedDistanceField.sample`."""
+    i, x, outside_x = _cell(point[0], field.lower[0], field.inverse, field.shape[0])
+    j, y, outside_y = _cell(point[1], field.lower[1], field.inverse, field.shape[1])
+    k, z, outside_z = _cell(point[2], field.lower[2], field.inverse, field.shape[2])
     outside = (outside_x, outside_y, outside_z)
     distant = math.sqrt(outside_x**2 + outside_y**2 + outside_z**2)
     row, plane = field.shape[2], field.shape[1] * field.shape[2]
@@ -80,10 +84,10 @@ def sample(field, table, point, value, slope):
 
 @inlined
 def distance_to(field, point):
-    """Interpolated distance (m) and its derivative: `sample` of the first channel alone."""
-    i, x, outside_x = _along(point[0], field.lower[0], field.inverse, field.shape[0])
-    j, y, outside_y = _along(point[1], field.lower[1], field.inverse, field.shape[1])
-    k, z, outside_z = _along(point[2], field.lower[2], field.inverse, field.shape[2])
+    """Interpolated distance [m] and its gradient: `sample` of the first channel alone."""
+    i, x, outside_x = _cell(point[0], field.lower[0], field.inverse, field.shape[0])
+    j, y, outside_y = _cell(point[1], field.lower[1], field.inverse, field.shape[1])
+    k, z, outside_z = _cell(point[2], field.lower[2], field.inverse, field.shape[2])
     row, plane, table = field.shape[2], field.shape[1] * field.shape[2], field.distance
     a = i * plane + j * row + k
     b = a + plane

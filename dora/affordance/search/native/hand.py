@@ -1,4 +1,4 @@
-"""Kinematics of one hand and forces on its bodies."""
+"""Forward kinematics of one hand and the forces on its bodies, in compiled loops."""
 
 import math
 from typing import NamedTuple
@@ -7,11 +7,11 @@ import numpy as np
 
 from dora.affordance.search.native.compiling import inlined, native
 
-SMALL = 1e-9
-"""Length (m) below which a direction is not divided by it."""
+SMALLEST_LENGTH = 1e-9
+"""Lower bound of a length by which a vector is divided [m]."""
 
-NO_TURN = 1e-12
-"""Angle (rad) of a step that does not turn."""
+SMALLEST_ROTATION = 1e-12
+"""Angle of rotation below which a pose is left unchanged [rad]."""
 
 
 class HandArrays(NamedTuple):
@@ -43,7 +43,7 @@ class HandArrays(NamedTuple):
 
 @native
 def forward(hand, wrist, joints, share, angles, poses):
-    """Angles of all joints and poses (bodies, 3, 4) of a hand closed by a share of `close`."""
+    """Writes the angles [rad] of all joints and the poses (bodies, 3, 4) of a hand closed by a share of `close`."""
     constant, cosines, sines, depth = hand.constant, hand.cosine, hand.sine, hand.depth
     for i in range(3):
         for k in range(4):
@@ -66,7 +66,7 @@ def forward(hand, wrist, joints, share, angles, poses):
 
 @inlined
 def point_of(poses, body, local, index):
-    """A point of a body (m) in the frame of the poses."""
+    """A point of a body in the frame of the poses [m]."""
     x, y, z = local[index, 0], local[index, 1], local[index, 2]
     return (
         poses[body, 0, 0] * x + poses[body, 0, 1] * y + poses[body, 0, 2] * z + poses[body, 0, 3],
@@ -82,8 +82,8 @@ def cross(a, b):
 
 
 @inlined
-def push(wrench, body, point, force):
-    """Adds a force at a point, and its moment about the origin, to the wrench on a body."""
+def add_force(wrench, body, point, force):
+    """Adds a force [N] at a point [m], and its moment about the origin, to the wrench on a body."""
     moment = cross(point, force)
     for i in range(3):
         wrench[body, i] += force[i]
@@ -92,9 +92,10 @@ def push(wrench, body, point, force):
 
 @native
 def self_penetration(hand, weight, stiffness, poses, ends, wrench):
-    """Sum of overlaps (m); capsules part with a force of `weight` and of `stiffness` times the overlap.
+    """Sum of the penetration depths of capsule pairs [m]; adds the forces that separate them to `wrench`.
 
-    `ends` (2 capsules, 3) is room for the ends of the capsules' axes.
+    The force on a pair is `weight` + `stiffness` times its penetration depth. `ends` (2 capsules, 3) is a workspace
+    for the end points of the axes.
     """
     body, local, pairs, bound = hand.capsule_body, hand.ends, hand.pairs, hand.bound
     for e in range(len(ends)):
@@ -112,31 +113,31 @@ def self_penetration(hand, weight, stiffness, poses, ends, wrench):
 
 @native
 def _overlap(radius, body, weight, stiffness, a, b, ends, wrench):
-    """Overlap (m) of two capsules, and the forces that part them."""
+    """Penetration depth of two capsules [m]; adds the forces that separate them."""
     uu = vv = ww = uv = uw = vw = 0.0
     for i in range(3):
         u, v = ends[2 * a + 1, i] - ends[2 * a, i], ends[2 * b + 1, i] - ends[2 * b, i]
         w = ends[2 * a, i] - ends[2 * b, i]
         uu, vv, ww, uv, uw, vw = uu + u * u, vv + v * v, ww + w * w, uv + u * v, uw + u * w, vw + v * w
-    s = min(max((uv * vw - uw * vv) / max(uu * vv - uv * uv, SMALL**2), 0.0), 1.0)
-    t = min(max((uv * s + vw) / max(vv, SMALL**2), 0.0), 1.0)
-    s = min(max((uv * t - uw) / max(uu, SMALL**2), 0.0), 1.0)
+    s = min(max((uv * vw - uw * vv) / max(uu * vv - uv * uv, SMALLEST_LENGTH**2), 0.0), 1.0)
+    t = min(max((uv * s + vw) / max(vv, SMALLEST_LENGTH**2), 0.0), 1.0)
+    s = min(max((uv * t - uw) / max(uu, SMALLEST_LENGTH**2), 0.0), 1.0)
     square = ww + s * s * uu + t * t * vv + 2 * (s * uw - t * vw - s * t * uv)
     limit = radius[a] + radius[b]
     if square >= limit * limit:
         return 0.0
     first, second = _between(ends, a, s), _between(ends, b, t)
     distance = math.sqrt(max(square, 0.0))
-    w = -(weight + stiffness * (limit - distance)) / max(distance, SMALL)
+    w = -(weight + stiffness * (limit - distance)) / max(distance, SMALLEST_LENGTH)
     force = (w * (first[0] - second[0]), w * (first[1] - second[1]), w * (first[2] - second[2]))
-    push(wrench, body[a], first, force)
-    push(wrench, body[b], second, (-force[0], -force[1], -force[2]))
+    add_force(wrench, body[a], first, force)
+    add_force(wrench, body[b], second, (-force[0], -force[1], -force[2]))
     return limit - distance
 
 
 @inlined
 def _between(ends, capsule, share):
-    """A point on a capsule's axis."""
+    """The point at a share of a capsule's axis."""
     a, b = 2 * capsule, 2 * capsule + 1
     return (
         ends[a, 0] + share * (ends[b, 0] - ends[a, 0]),
@@ -149,7 +150,7 @@ def _between(ends, capsule, share):
 def pull_back(hand, poses, wrench, gradient):
     """Adds the generalised forces of wrenches on the bodies to the gradient; as `HandModel.pull_back`.
 
-    `wrench` is used up: every body's gets those of the bodies beyond it.
+    `wrench` is overwritten: the wrench on each body becomes the sum over that body and those it carries.
     """
     axes, leader, gain, depth = hand.axes, hand.leader, hand.gain, hand.depth
     for joint in range(len(axes) - 1, -1, -1):
@@ -173,10 +174,10 @@ def pull_back(hand, poses, wrench, gradient):
 
 
 @native
-def turn(wrist, arm, rotation):
-    """Turns the axes of a pose by a rotation vector (rad) about the point that lies at its origin less `arm` (m)."""
+def rotate(wrist, arm, rotation):
+    """Rotates a pose in place by a rotation vector [rad] about the point at its origin less `arm` (3,) [m]."""
     angle = math.sqrt(rotation[0] ** 2 + rotation[1] ** 2 + rotation[2] ** 2)
-    if angle < NO_TURN:
+    if angle < SMALLEST_ROTATION:
         return
     axis = (rotation[0] / angle, rotation[1] / angle, rotation[2] / angle)
     cosine, sine = math.cos(angle), math.sin(angle)

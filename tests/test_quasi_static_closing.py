@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from dora.affordance.bundled_sets import load_candidates
+from dora.affordance.hand.grasp_test_settings import STANDARD, GraspTestSettings
 from dora.affordance.hand.hand_model import HandModel
-from dora.affordance.hand.protocol import STANDARD, Protocol, pregrasp, squeeze
+from dora.affordance.hand.postures import pregrasp, squeeze
 from dora.affordance.maps.contact_semantic_map import wrist_matrix
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.objects.signed_distance import SignedDistanceField
 from dora.affordance.search.compiled import CompiledEnergy
-from dora.affordance.search.quasi_static_closing import Holding, hold
+from dora.affordance.search.quasi_static_closing import ClosedHand, close_hand
 from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import load_robot
 
@@ -30,16 +31,16 @@ def held(
     energy: CompiledEnergy,
     away: float = 0.0,
     mass: float = CUBE.mass,
-    protocol: Protocol = STANDARD,
+    test_settings: GraspTestSettings = STANDARD,
     open_: bool = False,
-) -> Holding:
+) -> ClosedHand:
     """The best four stored grasps of the cube, moved up by `away` [m]."""
     grasps = load_candidates("cube").select(slice(4))
     wrist = torch.eye(4).repeat(4, 1, 1)
     wrist[:, :3, :3] = matrix_from_quaternion(grasps.quaternion)
     wrist[:, :3, 3] = grasps.position + torch.tensor([0.0, 0.0, away])
     opened = pregrasp(ROBOT, grasps.joints)
-    return hold(energy, wrist, opened, opened if open_ else squeeze(ROBOT, grasps.joints), mass, protocol)
+    return close_hand(energy, wrist, opened, opened if open_ else squeeze(ROBOT, grasps.joints), mass, test_settings)
 
 
 def test_grasps_that_hold_in_simulation_hold_in_the_model(energy: CompiledEnergy):
@@ -58,7 +59,7 @@ def test_a_hand_in_the_air_or_left_open_holds_nothing(energy: CompiledEnergy):
 
 def test_weight_and_slipperiness_tell(energy: CompiledEnergy):
     found = held(energy)
-    heavy, slippery = held(energy, mass=100 * CUBE.mass), held(energy, protocol=replace(STANDARD, friction=0.02))
+    heavy, slippery = held(energy, mass=100 * CUBE.mass), held(energy, test_settings=replace(STANDARD, friction=0.02))
     assert (heavy.displacement.amax(-1) > found.displacement.amax(-1)).all()
     assert (slippery.displacement.amax(-1) > found.displacement.amax(-1)).all()
     assert (heavy.quality < found.quality).all()
@@ -83,7 +84,10 @@ def test_the_best_are_the_same_when_others_are_given_up(energy: CompiledEnergy):
     grasps = load_candidates("cube").select(slice(0, 96, 4))
     wrist = wrist_matrix(grasps.position + torch.linspace(-0.02, 0.02, len(grasps))[:, None], grasps.quaternion)
     postures = pregrasp(ROBOT, grasps.joints), squeeze(ROBOT, grasps.joints)
-    every, some = hold(energy, wrist, *postures, CUBE.mass), hold(energy, wrist, *postures, CUBE.mass, wanted=5)
+    every, some = (
+        close_hand(energy, wrist, *postures, CUBE.mass),
+        close_hand(energy, wrist, *postures, CUBE.mass, wanted=5),
+    )
     best = every.quality.argsort(descending=True)[:5]
     assert torch.equal(some.quality.argsort(descending=True)[:5], best)
     torch.testing.assert_close(some.quality[best], every.quality[best], rtol=0, atol=0)

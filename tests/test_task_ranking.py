@@ -25,14 +25,14 @@ from dora.tools.task_ranking import (
 def test_a_proof_tells_a_good_grasp_from_one_in_the_air():
     good = load_candidates("cube").select([0])
     away = replace(good, position=good.position + torch.tensor([0.0, 0.0, 0.10]))
-    proof = rank_in_task("DoraCube-v1", concatenate([away, good]), 64, preset="none")
-    assert proof.tries.sum() <= 64
-    assert (proof.tries > 10).all()
-    assert proof.score[1] > 0.8
-    assert proof.score[0] == 0
-    best_first = ranked(concatenate([away, good]), proof)
+    ranking = rank_in_task("DoraCube-v1", concatenate([away, good]), 64, preset="none")
+    assert ranking.tries.sum() <= 64
+    assert (ranking.tries > 10).all()
+    assert ranking.score[1] > 0.8
+    assert ranking.score[0] == 0
+    best_first = ranked(concatenate([away, good]), ranking)
     torch.testing.assert_close(best_first.position[0], good.position[0])
-    assert best_first.score.tolist() == sorted(proof.score.tolist(), reverse=True)
+    assert best_first.score.tolist() == sorted(ranking.score.tolist(), reverse=True)
 
 
 def test_every_reachable_candidate_is_tried_equally_often_and_no_other():
