@@ -5,6 +5,7 @@
 
 import re
 import shutil
+import tomllib
 from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -22,6 +23,7 @@ from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import Coupling, RobotDescription, Shape, available_robots, load_robot
 from dora.robot.build import build_urdf, write_urdf
 from dora.robot.description import clique_cover
+from dora.robot.loading import _Reader
 from dora.robot.shapes import merge_capsules
 from dora.robot.visuals import build_meshes
 
@@ -316,6 +318,8 @@ SPOILED = {
     "NaN limit": (URDF, 'upper="3.054326"', 'upper="nan"', "finite limits"),
     "duplicate link": (URDF, '<link name="link2">', '<link name="link1">', "two links named 'link1'"),
     "two roots": (URDF, '<child link="link3"/>', '<child link="link4"/>', "one tree"),
+    "a loop": (URDF, '<parent link="link2"/>', '<parent link="link4"/>', "one tree"),
+    "no shape": (URDF, '<cylinder radius="0.092" length="0.022"/>', "", "a <geometry> is empty"),
     "unknown shape": (URDF, "<box size", "<ball size", "<ball> is not"),
     "no XML": (URDF, "</robot>", "", "not a URDF"),
     "chained coupling": (
@@ -346,6 +350,14 @@ def test_bad_files_are_refused_with_one_clear_sentence(folder, case):
     with pytest.raises(InputError, match=re.escape(message)) as caught:
         load_robot(folder)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["arm", "hand", "coupling", "fingers", "postures", "contact", "no_collision"])
+def test_a_number_in_place_of_a_table_is_refused(robot, key):
+    path = robot.folder / TOML
+    content = tomllib.loads(path.read_text()) | {key: 3}
+    with pytest.raises(InputError, match=f"{key} must be a"):
+        _Reader(path, robot.model).robot(content)
 
 
 def test_an_incomplete_parameter_table_is_refused(robot):

@@ -162,7 +162,7 @@ class _Reader:
             raise self.fail(f"{where} must be a list in which every name occurs once.")
         return tuple(names)
 
-    def group(self, table: Table, name: str) -> JointGroup:
+    def group(self, table: Any, name: str) -> JointGroup:
         """A joint group with limits from the URDF [rad, rad/s, N m] and gains from the table."""
         self.keys(table, "joint group", name)
         names = self.names(table["joints"], f"{name}.joints")
@@ -199,7 +199,7 @@ class _Reader:
                 raise self.fail(f"the leader of {name!r} follows another joint; name that one as leader.")
         return found
 
-    def coupling(self, table: Table, hand: JointGroup) -> Coupling:
+    def coupling(self, table: Any, hand: JointGroup) -> Coupling:
         """One coupling, its joints as indices into the hand group."""
         self.keys(table, "coupling", "a coupling")
         for key in ("follower", "leader"):
@@ -209,7 +209,7 @@ class _Reader:
         follower, leader = (hand.names.index(table[key]) for key in ("follower", "leader"))
         return Coupling(follower, leader, *factors.tolist())
 
-    def finger(self, name: str, table: Table, hand: JointGroup) -> Finger:
+    def finger(self, name: str, table: Any, hand: JointGroup) -> Finger:
         """One finger; `pad` is a point (3,) in its distal link's frame [m]."""
         self.keys(table, "finger", f"fingers.{name}")
         joints = self.names(table["joints"], f"fingers.{name}.joints")
@@ -219,7 +219,7 @@ class _Reader:
         links = {key: self.link(table[key]) for key in ("proximal", "medial", "distal", "tip")}
         return Finger(name, joints, **links, pad=self.numbers(table["pad"], 3, f"fingers.{name}.pad"))
 
-    def posture(self, name: str, table: Table, arm: JointGroup, hand: JointGroup) -> Posture:
+    def posture(self, name: str, table: Any, arm: JointGroup, hand: JointGroup) -> Posture:
         """A named posture (n_arm,), (n_hand,) [rad] within the joint limits."""
         self.keys(table, "posture", f"postures.{name}")
         angles = {}
