@@ -3,12 +3,10 @@
 import copy
 import functools
 import os
-import signal
 import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from dora.agents.collecting.task_env import Task, TaskEnv, TaskFactory
 from dora.agents.learners.networks import Policy
 from dora.errors import InputError
+from dora.parallel import sigint_blocked
 
 SHUTDOWN_SECONDS = 10.0  # workers that have not ended by then are killed
 LESS_URGENT = 5  # niceness of workers beside a busy learner, which all wait for
@@ -176,14 +175,3 @@ class Rollouts:
                         raise InputError(message) from None
                     raise RuntimeError(f"worker {index} failed with {kind}: {message}") from error
             raise
-
-
-@contextmanager
-def sigint_blocked() -> Iterator[None]:
-    """Block Ctrl-C while workers start: they keep the mask for good, this process gets the signal later."""
-    resource_tracker.ensure_running()  # unblocks SIGINT itself when it starts
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

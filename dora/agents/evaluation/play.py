@@ -1,5 +1,6 @@
 """A trained policy at work: evaluation of a checkpoint, and films."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
@@ -43,11 +44,14 @@ def evaluate_checkpoint(
 ) -> tuple[Checkpoint, Evaluation, Evaluation | None]:
     """Evaluate a checkpoint on the seeds of final evaluations; with guidance also no correction.
 
+    The networks are those of the checkpoint, whatever `config.learner` says.
+
     Raises:
         InputError: if it is no checkpoint or belongs to another task, learner or guidance.
     """
     checkpoint = read_checkpoint(path)
-    evaluators = Evaluators(functools.partial(make_task, config.eval_envs), config)
+    settings = dataclasses.replace(config, learner=checkpoint.config.learner)
+    evaluators = Evaluators(functools.partial(make_task, config.eval_envs), settings)
     try:
         check_belongs(checkpoint, path, config, evaluators.sizes, exactly=False)
         return checkpoint, *evaluators.final(load_policy(checkpoint, path))
