@@ -4,7 +4,6 @@ import contextlib
 import functools
 import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -114,7 +113,8 @@ class WorkerPool(Generic[Case, Result]):
         with sigint_blocked():
             if self._executor is None:
                 theirs, self._alive = Pipe(duplex=False)
-                self._executor = ProcessPoolExecutor(self.processes, _context(), _begin, (theirs, self._task))
+                context = _context(self._task.func.__module__)
+                self._executor = ProcessPoolExecutor(self.processes, context, _begin, (theirs, self._task))
             return self._executor.submit(_work, cases)
 
 
@@ -139,10 +139,10 @@ def run_cases(
         return pool.map(cases, progress=report, chunk=chunk)
 
 
-def warm_up() -> None:
-    """Begin to import, beside other work, what the worker processes will need; returns at once."""
+def warm_up(factory: Callable[..., Any]) -> None:
+    """Begin to import, beside other work, what worker processes with this factory will need; returns at once."""
     if available_cores() > 1:
-        _context()
+        _context(factory.__module__)
 
 
 @contextlib.contextmanager
@@ -156,15 +156,15 @@ def sigint_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _context() -> Any:
+def _context(module: str) -> Any:
     """Processes that inherit neither threads nor a renderer of this one.
 
-    Where the system can, they are forked from a server that has imported the modules of Dora that this process has.
+    Where the system can, they are forked from a server that has imported Dora and the module of the first factory.
     """
     if "forkserver" not in get_all_start_methods():
         return get_context("spawn")
     context = get_context("forkserver")
-    context.set_forkserver_preload([name for name in sys.modules if name.startswith("dora.")])
+    context.set_forkserver_preload(["dora", module])
     with sigint_blocked():
         forkserver.ensure_running()
     return context

@@ -7,7 +7,7 @@ import sys
 import tyro
 
 from dora.errors import InputError
-from dora.progress import PhaseProgress
+from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.tools import env_benchmark as benchmark
 from dora.tools import grasp_benchmark
@@ -69,7 +69,7 @@ def bench_physics(
         json: print one JSON object on the last line instead of a table.
     """
     asked = [task_physics.parse_physics(text) for text in settings]
-    with PhaseProgress() as progress:
+    with ProgressDisplay() as progress:
         update = progress.phase(f"physics of {env}", "settings")
         rows = task_physics.measure_physics(env, asked, starts, preset, progress=update)
     flat = [dataclasses.asdict(row.physics) | dataclasses.asdict(row) for row in rows]

@@ -18,7 +18,7 @@ from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.objects.importing import import_object
 from dora.errors import InputError
-from dora.progress import PhaseProgress
+from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.sim.grasp_tests.bundle_maker import make_bundle
 from dora.sim.grasp_tests.generation import baselines, by_region, generate, summary, voting_summary
@@ -101,7 +101,7 @@ def run(args: Args) -> None:
     out = args.out or Path("runs") / "grasps" / f"{obj.name}.safetensors"
     check_out(out)
     simulate = args.validate == "sapien"
-    with PhaseProgress() as phases:
+    with ProgressDisplay() as phases:
         generated = generate(obj, robot, args.num, args.seed, region, phases, simulate)
         report = summary(generated)
         searches = {}
@@ -122,7 +122,7 @@ def remake(args: Args) -> None:
     name = args.object or ""
     if not args.make_bundle and name not in TASKS:
         raise InputError(f"--prove needs --object, one of {', '.join(TASKS)}: no task proves {name!r}.")
-    with PhaseProgress() as phases:
+    with ProgressDisplay() as phases:
         if args.make_bundle:
             print(make_bundle(name, args.seed, phases, usable_in_task(name)))
         if name in TASKS:

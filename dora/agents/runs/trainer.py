@@ -30,8 +30,8 @@ from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.runs.interrupt import Interrupt
 from dora.agents.learners.learner import Learner, make_learner
 from dora.agents.runs.logging import RunLog
-from dora.agents.runs.progress import ProgressReport
 from dora.agents.runs.run_folder import RunFolder, make_result
+from dora.progress import ProgressDisplay
 
 TRAINING_SEEDS = 1_000_000_000  # seeds of training are below, those of evaluation above
 RECENT = 200  # training episodes over which the shown success rate is taken
@@ -99,7 +99,7 @@ class Trainer:
             log = RunLog(self.folder.path, first_step)
             finished = False
             try:
-                with self._rollouts() as rollouts, ProgressReport(self.config.total_steps) as progress:
+                with self._rollouts() as rollouts, ProgressDisplay() as progress:
                     self._train(rollouts, log, progress, interrupt)
                 self.save()
                 progress.say(f"last evaluation of the best policy, on {self.config.final_episodes} episodes ...")
@@ -144,9 +144,9 @@ class Trainer:
             torch.manual_seed(self._exploration_seed)
         return rollouts
 
-    def _train(self, rollouts: Rollouts, log: RunLog, progress: ProgressReport, interrupt: Interrupt) -> None:
+    def _train(self, rollouts: Rollouts, log: RunLog, progress: ProgressDisplay, interrupt: Interrupt) -> None:
         counters, config = self.counters, self.config
-        saved = time.monotonic()
+        show, saved = progress.bar("training"), time.monotonic()
         while counters.env_steps < config.total_steps:
             interrupt.check()
             start = time.perf_counter()
@@ -167,8 +167,13 @@ class Trainer:
                 self.save()
                 saved = time.monotonic()
             mean_rate = counters.env_steps / max(counters.wall_seconds, 1e-9)
-            best = counters.curve[-1][2] if counters.curve else None
-            progress.update(counters.env_steps, mean_rate, self._training_success(), best)
+            show(counters.env_steps, config.total_steps, mean_rate, self._status(mean_rate))
+
+    def _status(self, rate: float) -> str:
+        """Environment steps per second and the success rates in training and in the last evaluation."""
+        rates = self._training_success(), self.counters.curve[-1][2] if self.counters.curve else None
+        training, evaluated = ("-" if x is None else f"{x:.2f}" for x in rates)
+        return f"{rate:,.0f} steps/s, success {training} (evaluated {evaluated})"
 
     def _spend(self, what: str, seconds: float) -> None:
         self.counters.seconds[what] += seconds
@@ -199,7 +204,7 @@ class Trainer:
     def _evaluation_is_due(self) -> bool:
         return self.counters.env_steps >= self.counters.next_evaluation
 
-    def _evaluate(self, log: RunLog, progress: ProgressReport, interrupt: Interrupt) -> bool:
+    def _evaluate(self, log: RunLog, progress: ProgressDisplay, interrupt: Interrupt) -> bool:
         """Evaluate, keep the policy if it is the best so far, and tell whether the run may end."""
         counters, config = self.counters, self.config
         start = time.perf_counter()

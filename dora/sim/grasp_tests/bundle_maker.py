@@ -22,7 +22,7 @@ from dora.affordance.reach.feasibility_table import Grid, poses
 from dora.affordance.search.optimise import OFF_TABLE, Settings, optimise
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
-from dora.progress import PhaseProgress
+from dora.progress import ProgressDisplay
 from dora.robot import RobotDescription, load_robot
 from dora.sim.grasp_tests.lift_test import Execution, rank
 from dora.sim.grasp_tests.shake_test import validate
@@ -53,7 +53,7 @@ Usable = Callable[[GraspCandidates], Bool[Tensor, " c"]]
 """Tells which grasps a task can use."""
 
 
-def make_bundle(name: str, seed: int, phases: PhaseProgress, usable: Usable | None = None) -> Path:
+def make_bundle(name: str, seed: int, phases: ProgressDisplay, usable: Usable | None = None) -> Path:
     """Make and write the shipped set of an object; returns its file.
 
     Args:
@@ -77,7 +77,7 @@ class SetMaker:
     """Makes the shipped set of one object for one robot; `usable` as of `ship`."""
 
     def __init__(
-        self, obj: AffordanceObject, robot: RobotDescription, phases: PhaseProgress, usable: Usable | None = None
+        self, obj: AffordanceObject, robot: RobotDescription, phases: ProgressDisplay, usable: Usable | None = None
     ) -> None:
         self.obj, self.robot, self.phases, self.usable = obj, robot, phases, usable
         self.reach = Reach(robot, obj, start=STARTS.get(obj.name, "home"))

@@ -22,9 +22,9 @@ from dora.affordance.search.cache import map_of
 from dora.affordance.search.energies import Weights
 from dora.affordance.search.optimise import Settings, optimise
 from dora.parallel import warm_up
-from dora.progress import PhaseProgress
+from dora.progress import ProgressDisplay
 from dora.robot import RobotDescription
-from dora.sim.grasp_tests.shake_test import Validation, validate
+from dora.sim.grasp_tests.shake_test import ShakeTest, Validation, validate
 
 MILLIMETRES = 1000.0
 """Per metre."""
@@ -77,7 +77,7 @@ def generate(
     num: int,
     seed: int,
     region: str | None,
-    phases: PhaseProgress,
+    phases: ProgressDisplay,
     simulate: bool = True,
     settings: Settings | None = None,
     protocol: Protocol = STANDARD,
@@ -103,7 +103,7 @@ def generate(
     settings = settings or Settings()
     start = time.perf_counter()
     if simulate:
-        warm_up()
+        warm_up(ShakeTest)
     report = phases.phase(f"{name}: search", "candidates", scale=1 / settings.iterations)
     found = optimise(obj, robot, num, seed, region, settings, progress=report)
     between = time.perf_counter()
@@ -159,7 +159,7 @@ def baselines(
     num: int,
     seed: int,
     region: str | None,
-    phases: PhaseProgress,
+    phases: ProgressDisplay,
     simulate: bool = True,
 ) -> dict[str, dict[str, Any]]:
     """Summaries of `BASELINES`; arguments as of `generate`."""
@@ -170,7 +170,7 @@ def baselines(
 
 
 def by_region(
-    obj: AffordanceObject, robot: RobotDescription, num: int, seed: int, region: str | None, phases: PhaseProgress
+    obj: AffordanceObject, robot: RobotDescription, num: int, seed: int, region: str | None, phases: ProgressDisplay
 ) -> dict[str, Generated]:
     """Simulated grasps of a free search ("any") and of one for each region, but for the one that is `region`.
 
