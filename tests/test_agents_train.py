@@ -23,7 +23,7 @@ from dora.agents.config import PPOConfig, RunConfig, SACConfig
 from dora.agents.evaluation.play import evaluate_checkpoint, record
 from dora.agents.learners.networks import last_layer
 from dora.agents.learners.ppo import PPO
-from dora.agents.runs.logging import TAGS
+from dora.agents.runs.logging import TAGS, tags_table
 from dora.agents.runs.run_folder import RunFolder
 from dora.agents.runs.trainer import Trainer
 from dora.errors import InputError
@@ -274,6 +274,10 @@ def test_every_tag_written_is_explained(tmp_path: Path):
     families = ("episode/reward/", "episode/stage/", "evaluation/stage/", "episode/")
     unexplained = [t for t in tags if t not in TAGS and not t.startswith(families)]
     assert not unexplained
+
+
+def test_the_page_about_agents_has_the_table_of_tags(project_root: Path):
+    assert tags_table() in (project_root / "docs" / "agents.md").read_text()
 
 
 def test_a_film_is_written(tmp_path: Path):

@@ -9,6 +9,7 @@ import tyro
 from dora.errors import InputError
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
+from dora.tables import print_table
 from dora.tools import env_benchmark as benchmark
 from dora.tools import grasp_benchmark
 from dora.tools import physics_benchmark as task_physics
@@ -77,9 +78,7 @@ def bench_physics(
     if json:
         report({"env": env, "starts": starts, "preset": preset, "rows": flat}, True)
         return
-    print("".join(f"{name:>20}" for name in flat[0]))
-    for row in flat:
-        print("".join(f"{value:20.4g}" for value in row.values()))
+    print_table(list(flat[0]), [[f"{value:.4g}" for value in row.values()] for row in flat])
 
 
 def report(result: dict, as_json: bool) -> None:
@@ -87,8 +86,7 @@ def report(result: dict, as_json: bool) -> None:
     if as_json:
         print(json.dumps(result))
     else:
-        for name, value in result.items():
-            print(f"{name:32} {value}")
+        print_table(("what", "value"), [(name, str(value)) for name, value in result.items()])
 
 
 def main() -> int:

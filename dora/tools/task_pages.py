@@ -6,16 +6,12 @@ Each page keeps its hand-written part; what stands between the two marks is repl
 import sys
 from pathlib import Path
 
+from dora.tables import markdown_table
 from dora.tasks import make_task, task_ids
 from dora.tasks.env.base import DoraEnv
 from dora.tasks.mdp.randomisation import PRESETS
 
 BEGIN, END = "<!-- generated: begin -->", "<!-- generated: end -->"
-
-
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
 def tables(task: DoraEnv) -> str:
@@ -41,16 +37,16 @@ def tables(task: DoraEnv) -> str:
     return "\n\n".join(
         (
             f"### Observation ({start} numbers with guidance)",
-            _table(["index", "entry", "size", "unit", "meaning", "exists"], observation),
+            markdown_table(["index", "entry", "size", "unit", "meaning", "exists"], observation),
             f"### Action ({task.action_size} numbers in [-1, 1])",
             "0-2 wrist translation, 3-5 wrist rotation, then hand joints thumb to pinky. With guidance: the correction "
             "of the reference, in units of its bounds, in the hand frame.",
             "### Stages",
-            _table(["stage", "steps to hold", "falls back to"], stages),
+            markdown_table(["stage", "steps to hold", "falls back to"], stages),
             "### Reward terms",
-            _table(["term", "part", "weight", "meaning", "exists"], terms),
+            markdown_table(["term", "part", "weight", "meaning", "exists"], terms),
             "### Limits",
-            _table(["what", "value"], limits),
+            markdown_table(["what", "value"], limits),
         )
     )
 
@@ -79,7 +75,7 @@ def preset_table() -> str:
         "pushes": pushes,
     }
     names = [f"`{name}`" for name in PRESETS]
-    return _table(["what", *names], [[what, *values] for what, values in rows.items()])
+    return markdown_table(["what", *names], [[what, *values] for what, values in rows.items()])
 
 
 def refreshed(page: str, generated: str) -> str:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 from torch.utils.tensorboard import SummaryWriter
 
+from dora.tables import markdown_table
+
 TAGS: dict[str, str] = {
     "evaluation/success_rate": "share of evaluation episodes (fixed seeds, greedy) that end in success",
     "evaluation/return_mean": "mean sum of rewards of evaluation episodes",
@@ -44,8 +46,7 @@ LOSSES = frozenset(tag.removeprefix("loss/") for tag in TAGS if tag.startswith("
 
 def tags_table() -> str:
     """The tags as a Markdown table."""
-    rows = [f"| `{tag}` | {meaning} |" for tag, meaning in TAGS.items()]
-    return "\n".join(["| tag | meaning |", "|---|---|", *rows])
+    return markdown_table(("tag", "meaning"), [(f"`{tag}`", meaning) for tag, meaning in TAGS.items()])
 
 
 class RunLog:
