@@ -7,6 +7,7 @@ import sys
 import tyro
 
 from dora.errors import InputError
+from dora.parallel import available_cores
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.tables import print_table
@@ -21,7 +22,7 @@ app = tyro.extras.SubcommandApp()
 def bench_env(
     env: str = "PickCube-v1",
     num_envs: int = 256,
-    workers: int = benchmark.all_cores(),
+    workers: int = available_cores(),
     seconds: float = 10.0,
     json: bool = False,
 ) -> None:

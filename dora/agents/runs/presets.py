@@ -1,11 +1,11 @@
 """Recommended settings per task and learner: a bare command is the recommended one."""
 
 import dataclasses
-import os
 from typing import Any
 
 from dora.agents.config import GUIDANCES, LEARNER_CONFIGS, SINGLE_ARM_AGENTS, RunConfig
 from dora.errors import InputError
+from dora.parallel import available_cores
 
 DEFAULT_AGENT = "ppo"
 """The learner of a bare command."""
@@ -124,8 +124,3 @@ def with_total_steps(config: RunConfig, total_steps: int | None) -> RunConfig:
     config = config if total_steps is None else dataclasses.replace(config, total_steps=total_steps)
     check(config)
     return config
-
-
-def available_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

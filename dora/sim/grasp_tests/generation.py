@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Iterable
@@ -21,6 +20,7 @@ from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.search.cache import map_of
 from dora.affordance.search.energies import Weights
 from dora.affordance.search.optimise import Settings, optimise
+from dora.digests import digest_of
 from dora.parallel import warm_up
 from dora.progress import ProgressDisplay
 from dora.robot import RobotDescription
@@ -226,8 +226,7 @@ def _classes(candidates: GraspCandidates, voted: Int[Tensor, " c"], obj: Afforda
 
 def origin_digest(candidates: GraspCandidates) -> str:
     """sha256 of what candidates depend on: object, robot and settings."""
-    origin = [candidates.digest, candidates.robot_digest, candidates.settings]
-    return hashlib.sha256(json.dumps(origin).encode()).hexdigest()
+    return digest_of([candidates.digest, candidates.robot_digest, candidates.settings])
 
 
 def _share(mask: Tensor | None) -> float | None:
