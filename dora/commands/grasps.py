@@ -25,9 +25,12 @@ from dora.sim.grasp_tests.generation import baselines, by_region, generate, summ
 from dora.sim.grasp_tests.report import check_out, print_report, write_report
 from dora.tools.task_ranking import TASKS, rank_bundled_set, usable_in_task
 
-INTERRUPTED = 130  # exit status after Ctrl-C
-BAD_INPUT = 2  # exit status after input that a person can mend
-ANY = "any"  # value of --region for a free search
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+BAD_INPUT = 2
+"""Exit status after an `InputError`."""
+ANY = "any"
+"""Value of --region for a search without a region."""
 
 
 @dataclass

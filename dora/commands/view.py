@@ -28,8 +28,10 @@ from dora.affordance.views.page import GraspPage
 from dora.errors import InputError
 from dora.robot import load_robot
 
-BAD_INPUT = 2  # exit status after input that a person can mend
-GRASPS = ".safetensors"  # suffix of a file of grasps
+BAD_INPUT = 2
+"""Exit status after an `InputError`."""
+GRASPS = ".safetensors"
+"""Suffix of a file of grasps."""
 
 
 @dataclass

@@ -19,8 +19,10 @@ from dora.agents.learners.networks import Policy
 from dora.errors import InputError
 from dora.parallel import sigint_blocked
 
-SHUTDOWN_SECONDS = 10.0  # workers that have not ended by then are killed
-LESS_URGENT = 5  # niceness of workers beside a busy learner, which all wait for
+SHUTDOWN_SECONDS = 10.0
+"""Workers that have not ended after this time are killed [s]."""
+LESS_URGENT = 5
+"""Niceness of workers that collect while the learner is busy: the learner has priority."""
 
 
 class WorkerTaskEnv(TaskEnv):
@@ -65,7 +67,7 @@ class Rollouts:
 
     Args:
         make_task: makes one task batch; called once in each worker.
-        policy: acts; the workers use copies, brought up to date before each batch is begun.
+        policy: acts; the workers use copies, which get its weights before each batch.
         workers: worker processes, or 0 to collect in this process.
         rollout: control steps per environment and batch.
         seeds: one per worker (one if `workers` is 0), for its tasks and its exploration.
@@ -139,12 +141,12 @@ class Rollouts:
             return batch
 
     def _begin(self, waiting: ThreadPoolExecutor) -> Future[TensorDictBase]:
-        """Lets the workers collect, with the present policy, while a thread waits for them."""
+        """Start a batch with the present policy; a thread waits for it."""
         self._push()
         return waiting.submit(next, self._iterator)
 
     def _push(self) -> None:
-        """Gives the workers the present weights and normaliser of the policy."""
+        """Give the workers the present weights and normaliser of the policy."""
         if isinstance(self._collector, MultiSyncCollector):
             self._acting.load_state_dict(self._policy.state_dict())
             self._collector.update_policy_weights_()

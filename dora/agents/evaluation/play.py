@@ -1,4 +1,4 @@
-"""A trained policy at work: evaluation of a checkpoint, and films."""
+"""Evaluation of a checkpoint, and films of a policy."""
 
 import dataclasses
 import functools
@@ -20,7 +20,8 @@ from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.learner import make_learner
 from dora.agents.learners.networks import Policy
 
-FRAMES_PER_SECOND = 20  # of a film, if the task does not say its control frequency
+FRAMES_PER_SECOND = 20
+"""Rate of a film of a task that does not say its control frequency [Hz]."""
 
 
 def checkpoint_path(path: Path) -> Path:
@@ -93,6 +94,6 @@ def _frames(task: Any, act: Act, seed: int, low: Tensor, high: Tensor) -> list[n
 
 
 def _picture(image: Any) -> UInt8[np.ndarray, "h w 3"]:
-    """What `render` returned as one (h, w, 3) picture of bytes."""
+    """The image that `render` returned, as bytes."""
     array = image.cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
     return array.reshape(array.shape[-3:]).astype(np.uint8)

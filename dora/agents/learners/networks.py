@@ -17,12 +17,18 @@ from tensordict.nn import (
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
-CLIP = 6.0  # normalised observations stay within this many standard deviations
-VARIANCE_FLOOR = 1e-4  # keeps components that never change finite
-FIRST_OUTPUT_SCALE = 0.05  # shrinks the last layer: a new actor corrects nothing, a new critic has no opinion
-LOG_STD_MIN = -4.0  # smallest state-dependent log standard deviation, before the tanh
-LOG_STD_START = 2.0  # output of a new actor that stands for a log standard deviation 0.13 below its bound
-TANH_MARGIN = 1e-6  # keeps log(1 - tanh^2) finite
+CLIP = 6.0
+"""Normalised observations are clipped to this many standard deviations."""
+VARIANCE_FLOOR = 1e-4
+"""Added to the variance of every component, so that constant ones stay finite."""
+FIRST_OUTPUT_SCALE = 0.05
+"""Factor of the initial weights of the last layer: the outputs of new actors and critics are close to zero."""
+LOG_STD_MIN = -4.0
+"""Smallest state-dependent logarithm of the standard deviation, before the tanh."""
+LOG_STD_START = 2.0
+"""Initial output of an actor for the logarithm of the standard deviation: 0.13 below its bound."""
+TANH_MARGIN = 1e-6
+"""Added to 1 - tanh^2, so that its logarithm stays finite."""
 
 
 def mlp(sizes: Sequence[int], activation: type[nn.Module], layer_norm: bool = False) -> nn.Sequential:

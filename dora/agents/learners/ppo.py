@@ -12,10 +12,13 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from dora.agents.config import PPOConfig
 from dora.agents.learners.networks import Critic, GaussianActor, Normaliser, Policy, for_loss
 
-ADAM_EPSILON = 1e-8  # far below the gradients of values that are mean rewards
+ADAM_EPSILON = 1e-8
+"""Epsilon of Adam; far below the gradients, since values are in units of the mean reward."""
 LEARNING_RATE_DOWN, LEARNING_RATE_UP = 1.3, 1.2  # factors of the adaptation
-KL_BAND = 2.0  # the learning rate changes outside target_kl / KL_BAND .. target_kl * KL_BAND
-ADVANTAGE_FLOOR = 1e-6  # smallest standard deviation by which advantages are divided
+KL_BAND = 2.0
+"""The learning rate changes where the divergence is outside target_kl / KL_BAND .. target_kl * KL_BAND."""
+ADVANTAGE_FLOOR = 1e-6
+"""Smallest standard deviation by which advantages are divided."""
 
 
 class PPO:

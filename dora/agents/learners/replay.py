@@ -12,7 +12,8 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 from dora.errors import InputError
 from dora.files import write_bytes
 
-SHARD = 16_384  # transitions per file at most
+SHARD = 16_384
+"""Largest number of transitions per file."""
 
 
 class Replay:

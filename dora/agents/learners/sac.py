@@ -14,7 +14,8 @@ from dora.agents.config import SACConfig
 from dora.agents.learners.networks import Critic, Normaliser, Policy, TanhActor, for_loss
 from dora.agents.learners.replay import Replay
 
-ACTOR_PERIOD = 2  # gradient steps of the critics per step of actor and temperature
+ACTOR_PERIOD = 2
+"""Gradient steps of the critics per gradient step of actor and temperature."""
 
 
 class SAC:

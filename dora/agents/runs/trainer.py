@@ -33,8 +33,10 @@ from dora.agents.runs.logging import RunLog
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.progress import ProgressDisplay
 
-TRAINING_SEEDS = 1_000_000_000  # seeds of training are below, those of evaluation above
-RECENT = 200  # training episodes over which the shown success rate is taken
+TRAINING_SEEDS = 1_000_000_000
+"""Seeds of training are below this number, those of evaluation are not."""
+RECENT = 200
+"""Number of latest training episodes over which the displayed success rate is taken."""
 
 
 def seeds_for(seed: int, step: int, count: int) -> list[int]:
@@ -45,7 +47,7 @@ def seeds_for(seed: int, step: int, count: int) -> list[int]:
 
 @dataclass
 class Counters:
-    """Where a run stands; what a checkpoint keeps besides tensors."""
+    """Progress of a run: what a checkpoint keeps besides tensors."""
 
     env_steps: int = 0
     wall_seconds: float = 0.0
@@ -205,7 +207,7 @@ class Trainer:
         return self.counters.env_steps >= self.counters.next_evaluation
 
     def _evaluate(self, log: RunLog, progress: ProgressDisplay, interrupt: Interrupt) -> bool:
-        """Evaluate, keep the policy if it is the best so far, and tell whether the run may end."""
+        """Evaluate and keep the policy if it is the best so far; returns whether the run may end."""
         counters, config = self.counters, self.config
         start = time.perf_counter()
         evaluation = self._evaluators.run(self.learner.policy, config.eval_episodes, PERIODIC_SEED, interrupt.check)
@@ -235,11 +237,11 @@ class Trainer:
         return counters.reached >= 2
 
     def _keep_as_best(self) -> None:
-        """Write what it takes to act, without critics."""
+        """Write the networks that act, without critics."""
         self._checkpoint(pack_modules(self.learner.policy.modules_by_name)).write(self.folder.best)
 
     def _final_evaluation(self, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
-        """Evaluate the best policy, and no correction, on seeds that chose nothing."""
+        """Evaluate the best policy, and zero correction, on seeds that did not select it."""
         start = time.perf_counter()
         if self.folder.best.exists():
             best = read_checkpoint(self.folder.best)
