@@ -262,6 +262,15 @@ def test_kill_then_resume_then_ctrl_c(tmp_path: Path):
     assert session_empties(process.pid)
 
 
+def test_a_checkpoint_is_evaluated_with_its_own_networks(tmp_path: Path):
+    config = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=256)
+    run(tmp_path / "run", config)
+    others = dataclasses.replace(config, learner=dataclasses.replace(SMALL_PPO, hidden=(8, 8)))
+    best = RunFolder(tmp_path / "run").best
+    tables = [evaluate_checkpoint(best, asked, PointMass)[1].table for asked in (config, others)]
+    assert torch.equal(*tables)
+
+
 def test_every_tag_written_is_explained(tmp_path: Path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
