@@ -66,7 +66,7 @@ class Args:
     with and without asking for it, and how well the vote tells (needs --validate sapien)."""
     make_bundle: bool = False
     """Make the set that comes with Dora for --object instead: enough valid grasps, ranked by simulated lifts; then
-    what --prove does, where the object has a task with a table."""
+    what --rank-in-task does, where the object has a task with a table."""
     rank_in_task: bool = False
     """Execute the set that comes with Dora for --object in its task, and rank it by the episodes that succeed."""
 
@@ -121,10 +121,10 @@ def run(args: Args) -> None:
 
 
 def remake(args: Args) -> None:
-    """Make or prove the shipped set of an object."""
+    """Make the bundled set of an object, or rank it in its task."""
     name = args.object or ""
     if not args.make_bundle and name not in TASKS:
-        raise InputError(f"--prove needs --object, one of {', '.join(TASKS)}: no task proves {name!r}.")
+        raise InputError(f"--rank-in-task needs --object, one of {', '.join(TASKS)}: {name!r} has no task.")
     with ProgressDisplay() as phases:
         if args.make_bundle:
             print(make_bundle(name, args.seed, phases, usable_in_task(name)))
