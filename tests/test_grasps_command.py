@@ -49,7 +49,8 @@ def script() -> ModuleType:
         ("--object jug --out /proc/nowhere/a.safetensors", "choose another --out"),
         ("--object jug --robot ur5", "unknown robot 'ur5'"),
         ("--mesh nowhere.stl", "nowhere.stl"),
-        ("--ship", "no object ''"),
+        ("--make-bundle", "no object ''"),
+        ("--rank-in-task --object microwave", "--rank-in-task needs --object"),
     ],
 )
 def test_bad_input(
