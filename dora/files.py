@@ -17,6 +17,9 @@ from torch import Tensor
 
 from dora.errors import InputError
 
+METADATA = "metadata"
+"""Entry of a file's header with the metadata of `write_tensors`, which its digest covers."""
+
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Replace `path` by `content` atomically: write a file beside it, flush it to the disk, rename it.
@@ -83,9 +86,7 @@ def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], metadata
     Raises:
         InputError: as `write_bytes`.
     """
-    own = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
-    text = json.dumps(dict(metadata))
-    write_bytes(path, save(own, {"format": kind, "metadata": text, "sha256": tensor_digest(own, text)}))
+    write_safetensors(path, tensors, {"format": kind, METADATA: json.dumps(dict(metadata))})
 
 
 def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -94,25 +95,46 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, An
     Raises:
         InputError: the file is missing, truncated, damaged, or of another format or version than `kind`.
     """
+    tensors, header = read_safetensors(path, f"{kind} file", {"format": kind})
+    return tensors, json.loads(header[METADATA])
+
+
+def write_safetensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
+    """Replace `path` by a safetensors file with a header and, in it, a digest of the tensors."""
+    own = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    write_bytes(path, save(own, {**header, "sha256": _digest(own, header)}))
+
+
+def read_safetensors(path: Path, what: str, required: Mapping[str, str]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and header of a file written by `write_safetensors`.
+
+    Args:
+        path: of the file.
+        what: it is, for messages.
+        required: entries that its header must have, such as format and version.
+
+    Raises:
+        InputError: if it is missing, truncated, damaged, or lacks a required entry.
+    """
     if not path.is_file():
-        raise InputError(f"There is no file {path}: give the path of a {kind} file (.safetensors).")
+        raise InputError(f"There is no {what} {path}: give the path of one (.safetensors).")
     try:
         with safe_open(path, framework="pt") as stream:
             header = stream.metadata() or {}
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise InputError(f"{path} is truncated, damaged or no {kind} file ({error}): make it again.") from error
-    if header.get("format") != kind:
+        raise InputError(f"{path} is truncated, damaged or no {what} ({error}): use another one.") from error
+    if any(header.get(name) != value for name, value in required.items()):
         found = header.get("format", "another format")
-        raise InputError(f"{path} is {found}, not {kind}: give a {kind} file, or make it again with this version.")
-    if header.get("sha256") != tensor_digest(tensors, header.get("metadata", "")):
-        raise InputError(f"{path} is damaged (its digest differs): make it again.")
-    return tensors, json.loads(header["metadata"])
+        raise InputError(f"{path} is {found}, no {what} of this version of Dora: use another one, or make it again.")
+    if header.get("sha256") != _digest(tensors, header):
+        raise InputError(f"{path} is damaged (its digest differs): use another one, or make it again.")
+    return tensors, header
 
 
-def tensor_digest(tensors: Mapping[str, Tensor], text: str = "") -> str:
-    """sha256 over names, types, shapes and values of CPU tensors, and over `text`."""
-    digest = hashlib.sha256(text.encode())
+def _digest(tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> str:
+    """sha256 over names, types, shapes and values of CPU tensors, and over the metadata of `write_tensors`."""
+    digest = hashlib.sha256(header.get(METADATA, "").encode())
     for name in sorted(tensors):
         value = tensors[name]
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())

@@ -1,11 +1,16 @@
-"""Many independent cases on all cores: one task object per process, cases handed out in small chunks."""
+"""Worker processes: many independent cases on all cores, one task object per process; the count of cores."""
 
+import contextlib
+import functools
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import forkserver, get_all_start_methods, get_context
-from typing import Any, TypeVar
+from multiprocessing import Pipe, forkserver, get_all_start_methods, get_context, resource_tracker
+from multiprocessing.connection import Connection
+from typing import Any, Generic, TypeVar
 
 import torch
 
@@ -16,13 +21,101 @@ Progress = Callable[[int, int], None]
 
 CHUNK = 4
 """Cases that a process takes at once, where they are short."""
-PRELOADED = ["dora.sim.grasp_tests.shake_test", "dora.sim.grasp_tests.lift_test"]
-"""Modules that are imported once for all processes, where the system can fork them from a clean server."""
+POLL_SECONDS = 0.2
+"""Longest time between two calls of `check` while workers are busy [s]."""
+DIED = "a worker process died (a crash in native code, or too little memory): run with one process to see why."
 
 
 def available_cores() -> int:
-    """Cores that this process may use."""
+    """Number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class WorkerPool(Generic[Case, Result]):
+    """A `ProcessPoolExecutor` whose processes each hold one task; a context manager.
+
+    Processes start when there are cases for them and stay until `close`. They do not see Ctrl-C, and end with this
+    process, also when that is killed.
+
+    Args:
+        factory: makes the task from `arguments`; called once per process, with the first case. Must be importable by
+            name.
+        arguments: of the factory; they, the cases and the results must be picklable.
+        processes: at most so many.
+    """
+
+    def __init__(self, factory: Callable[..., Callable[[Case], Result]], arguments: tuple[Any, ...], processes: int):
+        self._task, self.processes = functools.partial(factory, *arguments), processes
+        self._executor: ProcessPoolExecutor | None = None
+        self._alive: Connection | None = None
+
+    def map(
+        self,
+        cases: Sequence[Case],
+        here: Callable[[Case], Result] | None = None,
+        progress: Progress = lambda done, total: None,
+        check: Callable[[], None] = lambda: None,
+        chunk: int = 1,
+    ) -> list[Result]:
+        """Results of all cases, in their order; whatever is raised ends the processes.
+
+        Args:
+            cases: what the task is called with, one after the other.
+            here: task of this process, which then does its share of the cases, too.
+            progress: told about cases that are done.
+            check: called now and then while this process waits; may raise.
+            chunk: cases that a process takes at once.
+
+        Raises:
+            RuntimeError: a process died.
+            Exception: what the task raised first.
+        """
+        parts = [range(start, min(start + chunk, len(cases))) for start in range(0, len(cases), chunk)]
+        takers = self.processes + (here is not None)
+        own = parts[::takers] if here is not None else []
+        others = [part for i, part in enumerate(parts) if here is None or i % takers]
+        found: dict[int, Result] = {}
+
+        def add(part: range, results: list[Result]) -> None:
+            found.update(zip(part, results, strict=True))
+            progress(len(found), len(cases))
+
+        try:
+            pending = {self._submit([cases[i] for i in part]): part for part in others}
+            for part in own:
+                add(part, [here(cases[i]) for i in part])  # pyright: ignore[reportOptionalCall]
+            while pending:
+                for future in wait(pending, POLL_SECONDS, FIRST_COMPLETED).done:
+                    add(pending.pop(future), future.result())
+                check()
+        except BrokenProcessPool as error:
+            self.close()
+            raise RuntimeError(DIED) from error
+        except BaseException:
+            self.close()
+            raise
+        return [found[i] for i in range(len(cases))]
+
+    def close(self) -> None:
+        """End the processes, whatever they are doing; `map` may start new ones."""
+        if self._executor is not None and self._alive is not None:
+            self._alive.close()
+            self._executor.shutdown(cancel_futures=True)
+            self._executor = None
+
+    def __enter__(self) -> "WorkerPool[Case, Result]":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _submit(self, cases: list[Case]) -> Future[list[Result]]:
+        with sigint_blocked():
+            if self._executor is None:
+                theirs, self._alive = Pipe(duplex=False)
+                context = _context(self._task.func.__module__)
+                self._executor = ProcessPoolExecutor(self.processes, context, _begin, (theirs, self._task))
+            return self._executor.submit(_work, cases)
 
 
 def run_cases(
@@ -33,73 +126,69 @@ def run_cases(
     progress: Progress | None = None,
     chunk: int = CHUNK,
 ) -> list[Result]:
-    """Results of all cases, in their order.
+    """Results of all cases, in their order, by processes that end with the call.
 
-    Args:
-        factory: makes the task from `arguments`; called once per process. Must be importable by name.
-        arguments: of the factory; they and cases and results must be picklable.
-        cases: what the task is called with, one after the other.
+    Args and errors as for `WorkerPool`, besides:
         processes: number of processes; one per core by default. With 1 everything runs in this process.
-        progress: told about cases that are done.
-        chunk: cases that a process takes at once.
-
-    Raises:
-        RuntimeError: a process died (a crash in native code, or too little memory).
-        Exception: whatever the task raised first; nothing goes on running then.
     """
     count = min(processes or available_cores(), -(-len(cases) // chunk))
     report = progress or (lambda done, total: None)
     if count <= 1:
-        task, results = factory(*arguments), []
-        for case in cases:
-            results.append(task(case))
-            report(len(results), len(cases))
-        return results
-    chunks = [range(start, min(start + chunk, len(cases))) for start in range(0, len(cases), chunk)]
-    found: dict[int, Result] = {}
-    with ProcessPoolExecutor(count, _context(), _remember, (factory, arguments)) as pool:
-        pending = {pool.submit(_work, [cases[i] for i in part]): part for part in chunks}
-        try:
-            for future in as_completed(pending):
-                found.update(zip(pending[future], future.result(), strict=True))
-                report(len(found), len(cases))
-        except BrokenProcessPool as error:
-            raise RuntimeError("a simulating process died; run with one process to see why.") from error
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-    return [found[i] for i in range(len(cases))]
+        return WorkerPool(factory, arguments, 0).map(cases, factory(*arguments), report)
+    with WorkerPool(factory, arguments, count) as pool:
+        return pool.map(cases, progress=report, chunk=chunk)
 
 
-def warm_up() -> None:
-    """Begin to import, beside other work, what the processes of `run_cases` will need; returns at once."""
-    if "forkserver" in get_all_start_methods() and available_cores() > 1:
-        _context()
-        forkserver.ensure_running()
+def warm_up(factory: Callable[..., Any]) -> None:
+    """Begin to import, beside other work, what worker processes with this factory will need; returns at once."""
+    if available_cores() > 1:
+        _context(factory.__module__)
 
 
-def _context() -> Any:
-    """Processes that inherit neither threads nor a renderer of this one."""
+@contextlib.contextmanager
+def sigint_blocked() -> Iterator[None]:
+    """Block Ctrl-C while processes start: they keep the mask for good, this process gets the signal later."""
+    resource_tracker.ensure_running()  # unblocks SIGINT itself when it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _context(module: str) -> Any:
+    """Processes that inherit neither threads nor a renderer of this one.
+
+    Where the system can, they are forked from a server that has imported Dora and the module of the first factory.
+    """
     if "forkserver" not in get_all_start_methods():
         return get_context("spawn")
     context = get_context("forkserver")
-    context.set_forkserver_preload(PRELOADED)
+    context.set_forkserver_preload(["dora", module])
+    with sigint_blocked():
+        forkserver.ensure_running()
     return context
 
 
-_recipe: tuple[Callable[..., Any], tuple[Any, ...]] | None = None
-_task: Callable[[Any], Any] | None = None
+_task: Callable[[], Callable[[Any], Any]] | None = None
+"""In a worker process: gives its task, which the first call makes."""
 
 
-def _remember(factory: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    """Start of a process: the task is made with the first chunk, where an exception reaches the caller."""
-    global _recipe
-    _recipe = factory, arguments
+def _begin(alive: Connection, make_task: Callable[[], Callable[[Any], Any]]) -> None:
+    """Start of a worker process; the task is made with the first cases, where an exception reaches the caller."""
+    global _task
+    _task = functools.cache(make_task)
     torch.set_num_threads(1)
+    threading.Thread(target=_end_with, args=(alive,), daemon=True).start()
+
+
+def _end_with(alive: Connection) -> None:
+    """Ends this process when the other end of a pipe is closed, by `WorkerPool.close` or the end of its process."""
+    alive.poll(None)
+    os._exit(1)
 
 
 def _work(cases: list[Any]) -> list[Any]:
-    global _task
-    assert _recipe is not None
-    task = _task or _recipe[0](*_recipe[1])
-    _task = task
+    assert _task is not None
+    task = _task()
     return [task(case) for case in cases]

@@ -1,4 +1,4 @@
-"""What a long command shows while it works: a bar per phase on a terminal, plain lines elsewhere."""
+"""Progress of a long command: bars on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ LINE_SECONDS = 10.0
 """Time between two plain lines [s]."""
 
 
-class PhaseProgress:
-    """Progress of the phases of a command, each with its rate and the time left; a context manager.
+class ProgressDisplay:
+    """Bars with status and time left, one for each thing that is being done; a context manager.
 
     Args:
         console: where to draw (default: standard error).
@@ -23,46 +23,54 @@ class PhaseProgress:
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or Console(stderr=True)
         self._next_line = 0.0
-        self._bar = Progress(
+        self._bars = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
             TaskProgressColumn(),
-            TextColumn("{task.fields[rate]}"),
+            TextColumn("{task.fields[status]}"),
             TextColumn("ETA"),
             TimeRemainingColumn(),
             console=self.console,
             disable=not self.console.is_terminal,
         )
 
-    def __enter__(self) -> PhaseProgress:
-        self._bar.start()
+    def __enter__(self) -> ProgressDisplay:
+        self._bars.start()
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self._bar.stop()
+        self._bars.stop()
+
+    def bar(self, name: str) -> Callable[[int, int, float, str], None]:
+        """A new bar; returns what is to be called with (done, total, done per second, status) now and then."""
+        task = self._bars.add_task(name, total=None, status="")
+
+        def update(done: int, total: int, rate: float, status: str) -> None:
+            self._bars.update(task, completed=done, total=total, status=status)
+            now = time.monotonic()
+            if not self.console.is_terminal and now >= self._next_line:
+                self._next_line = now + LINE_SECONDS
+                left = f"{max(total - done, 0) / rate:.0f} s" if rate > 0 else "unknown"
+                self.say(f"{name}: {done:,}/{total:,}, {status}, ETA {left}")
+
+        return update
 
     def phase(self, name: str, unit: str, scale: float = 1.0) -> Callable[[int, int], None]:
-        """A new bar; returns what is to be called with (done, total) now and then.
+        """A new bar whose status is the rate since now; returns what is to be called with (done, total) now and then.
 
         Args:
             name: what is being done.
             unit: what is counted, in the plural.
             scale: units per step of `done`.
         """
-        task = self._bar.add_task(name, total=None, rate="")
-        start = time.monotonic()
+        update, start = self.bar(name), time.monotonic()
 
-        def update(done: int, total: int) -> None:
+        def report(done: int, total: int) -> None:
             rate = done / max(time.monotonic() - start, 1e-9)
-            text = f"{scale * rate:,.3g} {unit}/s"
-            self._bar.update(task, completed=done, total=total, rate=text)
-            left = f"{(total - done) / rate:.0f} s" if rate > 0 else "unknown"
-            self._line(f"{name}: {done}/{total}, {text}, ETA {left}")
+            update(done, total, rate, f"{scale * rate:,.3g} {unit}/s")
 
-        return update
+        return report
 
-    def _line(self, text: str) -> None:
-        now = time.monotonic()
-        if not self.console.is_terminal and now >= self._next_line:
-            self._next_line = now + LINE_SECONDS
-            self.console.print(text, highlight=False, soft_wrap=True)
+    def say(self, text: str) -> None:
+        """Print one line above the bars."""
+        self.console.print(text, highlight=False, soft_wrap=True)

@@ -23,7 +23,7 @@ from dora.agents.config import PPOConfig, RunConfig, SACConfig
 from dora.agents.evaluation.play import evaluate_checkpoint, record
 from dora.agents.learners.networks import last_layer
 from dora.agents.learners.ppo import PPO
-from dora.agents.runs.logging import TAGS
+from dora.agents.runs.logging import TAGS, tags_table
 from dora.agents.runs.run_folder import RunFolder
 from dora.agents.runs.trainer import Trainer
 from dora.errors import InputError
@@ -183,11 +183,12 @@ def test_the_message_of_a_failing_worker_arrives(ahead: bool):
 
 
 def children() -> set[str]:
-    """Python processes started by this one, but for the resource tracker."""
+    """Python processes started by this one, but for the interpreter's own, which end with it."""
     out = subprocess.run(
         ["ps", "--ppid", str(os.getpid()), "-o", "pid=,args="], capture_output=True, text=True, check=True
     ).stdout
-    return {line.strip() for line in out.splitlines() if "python" in line and "resource_tracker" not in line}
+    own = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
+    return {line.strip() for line in out.splitlines() if "python" in line and not any(name in line for name in own)}
 
 
 SCRIPT = """
@@ -261,6 +262,15 @@ def test_kill_then_resume_then_ctrl_c(tmp_path: Path):
     assert session_empties(process.pid)
 
 
+def test_a_checkpoint_is_evaluated_with_its_own_networks(tmp_path: Path):
+    config = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=256)
+    run(tmp_path / "run", config)
+    others = dataclasses.replace(config, learner=dataclasses.replace(SMALL_PPO, hidden=(8, 8)))
+    best = RunFolder(tmp_path / "run").best
+    tables = [evaluate_checkpoint(best, asked, PointMass)[1].table for asked in (config, others)]
+    assert torch.equal(*tables)
+
+
 def test_every_tag_written_is_explained(tmp_path: Path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -273,6 +283,10 @@ def test_every_tag_written_is_explained(tmp_path: Path):
     families = ("episode/reward/", "episode/stage/", "evaluation/stage/", "episode/")
     unexplained = [t for t in tags if t not in TAGS and not t.startswith(families)]
     assert not unexplained
+
+
+def test_the_page_about_agents_has_the_table_of_tags(project_root: Path):
+    assert tags_table() in (project_root / "docs" / "agents.md").read_text()
 
 
 def test_a_film_is_written(tmp_path: Path):

@@ -141,7 +141,7 @@ def test_damage_is_noticed(candidates: GraspCandidates, tmp_path: Path):
     path = tmp_path / "a.safetensors"
     with pytest.raises(InputError) as error:
         GraspCandidates.load(path)
-    one_sentence(error, "There is no file")
+    one_sentence(error, "There is no dora-grasps 1 file")
     candidates.save(path)
     whole = path.read_bytes()
     flipped = bytearray(whole)
@@ -156,7 +156,7 @@ def test_damage_is_noticed(candidates: GraspCandidates, tmp_path: Path):
     save_file({"a": torch.zeros(2)}, path)
     with pytest.raises(InputError) as error:
         GraspCandidates.load(path)
-    one_sentence(error, "not dora-grasps 1")
+    one_sentence(error, "no dora-grasps 1 file")
 
 
 def test_the_hand_digest_sees_the_hand_and_not_the_arm(robot: RobotDescription):

@@ -16,7 +16,7 @@ from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.search.optimise import Settings
-from dora.progress import PhaseProgress
+from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.sim.grasp_tests import generation as grasps
 from dora.sim.grasp_tests.shake_test import Reason, Validation
@@ -139,7 +139,7 @@ def test_validity_is_that_of_the_simulation(monkeypatch: pytest.MonkeyPatch):
         )  # fmt: skip
 
     monkeypatch.setattr(grasps, "validate", judge)
-    generated = grasps.generate(obj, robot, 6, 0, None, PhaseProgress(), True, QUICK)
+    generated = grasps.generate(obj, robot, 6, 0, None, ProgressDisplay(), True, QUICK)
     report = grasps.summary(generated)
     assert generated.candidates.valid.tolist() == [False, True, False, False, False, True]
     assert report["valid"] == 2

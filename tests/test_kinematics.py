@@ -66,8 +66,8 @@ def dh_pose(q: np.ndarray) -> np.ndarray:
 
 def error_twist(target: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
     """Displacement (n, 6) from `pose` to `target`, both (n, 4, 4)."""
-    turn = rot.rotation_vector_from_matrix(target[:, :3, :3] @ pose[:, :3, :3].transpose(1, 2))
-    return torch.cat((target[:, :3, 3] - pose[:, :3, 3], turn), 1)
+    turn = rot.quaternion_from_matrix(target[:, :3, :3] @ pose[:, :3, :3].transpose(1, 2))
+    return torch.cat((target[:, :3, 3] - pose[:, :3, 3], rot.rotation_vector_from_quaternion(turn)), 1)
 
 
 def test_arm_agrees_with_the_dh_table(chain):

@@ -22,11 +22,10 @@ from dora.affordance.reach.feasibility import Reach
 from dora.affordance.reach.feasibility_table import Grid, ReachTable, table_digest
 from dora.errors import InputError
 from dora.geometry.rotations import (
-    matrix_from_quaternion,
     quaternion_apply,
     quaternion_from_matrix,
     quaternion_multiply,
-    rotation_vector_from_matrix,
+    rotation_angle,
 )
 from dora.robot import SerialChain, load_robot
 from dora.robot.motion import controller_rollout, inverse_kinematics
@@ -111,9 +110,7 @@ def test_solves_random_reachable_poses(robot, kinematics):
     best, solved = found.q[:, 0].double(), found.solved[:, 0]
     place, turn = SerialChain.of(robot, dtype=torch.float64).tip_pose(best)
     away = (place - position).norm(dim=1)[solved]
-    angle = rotation_vector_from_matrix(
-        matrix_from_quaternion(quaternion.double()) @ turn.transpose(1, 2)
-    ).norm(dim=1)[solved]  # fmt: skip
+    angle = rotation_angle(quaternion.double(), quaternion_from_matrix(turn))[solved]
     assert away.max() < POSITION_TOLERANCE + 1e-6
     assert angle.max() < ANGLE_TOLERANCE + 1e-5
     assert ((found.q >= kinematics.lower) & (found.q <= kinematics.upper)).all()

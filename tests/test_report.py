@@ -1,7 +1,9 @@
 """Reports are made from result files, and say so when there are none."""
 
 import json
+import re
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
 
@@ -16,11 +18,12 @@ def write_run(
     guidance: str = "affordance",
     finished: bool = True,
     steps: int = 1000,
+    env: str = "Toy-v1",
     **task: object,
 ) -> None:
     folder.mkdir(parents=True)
     result = {
-        "env": "Toy-v1", "agent": "ppo", "guidance": guidance, "seed": seed, "env_steps": steps, "wall_seconds": 90.0,
+        "env": env, "agent": "ppo", "guidance": guidance, "seed": seed, "env_steps": steps, "wall_seconds": 90.0,
         "success_rate": success, "zero_success_rate": 0.5 if guidance == "affordance" else None,
         "penetration_p95_mm": 2.0, "finished": finished, "task": task,
     }  # fmt: skip
@@ -55,6 +58,19 @@ def test_a_report_has_a_table_a_page_and_a_figure(tmp_path: Path):
     assert {p.name for p in paths} == {"tables.md", "report.html", "Toy-v1.png", "Toy-v1-hard.png"}
     assert all(p.stat().st_size > 100 for p in paths)
     assert "Toy-v1.png" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_names_from_files_are_text_in_a_report(tmp_path: Path):
+    name = '<script>alert("$1|2")</script>'
+    write_run(tmp_path / "runs" / "a", 0, 0.9, env=name)
+    table, page, figure = write_report(tmp_path / "runs", tmp_path / "out")
+    for text in (table.read_text(), page.read_text()):
+        assert "<script" not in text
+        assert "&lt;script&gt;alert" in text
+    assert "1\\|2" in table.read_text()
+    assert figure.parent == tmp_path / "out"
+    [source] = re.findall('src="(.*?)"', page.read_text())
+    assert unquote(source) == figure.name
 
 
 def test_no_runs_and_damaged_ones_are_refused(tmp_path: Path):

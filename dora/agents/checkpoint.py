@@ -1,6 +1,5 @@
 """Checkpoints: safetensors files with everything a run needs to go on, and what they belong to."""
 
-import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,14 +7,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from dora.agents.config import RunConfig, config_from_dict
 from dora.configs import plain
 from dora.errors import InputError
-from dora.files import write_bytes
+from dora.files import read_safetensors, write_safetensors
 
 FORMAT = "dora-checkpoint"
 """Format of a checkpoint file."""
@@ -46,17 +43,15 @@ class Checkpoint:
         Raises:
             InputError: if the disk is full; an older file survives.
         """
-        tensors = {name: value.detach().contiguous().clone() for name, value in self.tensors.items()}
-        metadata = {
+        header = {
             "format": FORMAT,
             "version": str(VERSION),
             "config": json.dumps(plain(self.config)),
             "config_digest": self.config.digest(),
             "sizes": json.dumps(self.sizes),
             "progress": json.dumps(self.progress),
-            "sha256": _digest(tensors),
         }
-        write_bytes(path, save(tensors, metadata))
+        write_safetensors(path, self.tensors, header)
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
@@ -65,22 +60,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     Raises:
         InputError: if it is missing, truncated, damaged or something else.
     """
-    if not path.is_file():
-        raise InputError(f"There is no checkpoint {path}: give the path of a .safetensors file of a run.")
-    try:
-        with safe_open(path, framework="pt") as stream:
-            metadata = stream.metadata() or {}
-            tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise InputError(
-            f"{path} is truncated, damaged or no checkpoint ({error}): use another checkpoint of the run."
-        ) from error
-    if metadata.get("format") != FORMAT or metadata.get("version") != str(VERSION):
-        raise InputError(
-            f"{path} is no checkpoint of this version of Dora: give a file from a run's checkpoints folder."
-        )
-    if metadata["sha256"] != _digest(tensors):
-        raise InputError(f"{path} is damaged (its digest differs): use another checkpoint of the run.")
+    tensors, metadata = read_safetensors(path, "checkpoint", {"format": FORMAT, "version": str(VERSION)})
     observation, action = json.loads(metadata["sizes"])
     return Checkpoint(
         config_from_dict(json.loads(metadata["config"])),
@@ -185,12 +165,3 @@ def unpack_rng(tensors: dict[str, Tensor]) -> None:
     position, has_gauss, gauss = tensors["rng/numpy_rest"].tolist()
     keys = tensors["rng/numpy_keys"].numpy().astype(np.uint32)
     np.random.set_state(("MT19937", keys, int(position), int(has_gauss), gauss))  # noqa: NPY002
-
-
-def _digest(tensors: dict[str, Tensor]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(tensors):
-        value = tensors[name]
-        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(value.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()

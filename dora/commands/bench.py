@@ -7,8 +7,10 @@ import sys
 import tyro
 
 from dora.errors import InputError
-from dora.progress import PhaseProgress
+from dora.parallel import available_cores
+from dora.progress import ProgressDisplay
 from dora.robot import load_robot
+from dora.tables import print_table
 from dora.tools import env_benchmark as benchmark
 from dora.tools import grasp_benchmark
 from dora.tools import physics_benchmark as task_physics
@@ -20,7 +22,7 @@ app = tyro.extras.SubcommandApp()
 def bench_env(
     env: str = "PickCube-v1",
     num_envs: int = 256,
-    workers: int = benchmark.all_cores(),
+    workers: int = available_cores(),
     seconds: float = 10.0,
     json: bool = False,
 ) -> None:
@@ -70,7 +72,7 @@ def bench_physics(
         json: print one JSON object on the last line instead of a table.
     """
     asked = [task_physics.parse_physics(text) for text in settings]
-    with PhaseProgress() as progress:
+    with ProgressDisplay() as progress:
         update = progress.phase(f"physics of {env}", "settings")
         rows = task_physics.measure_physics(env, asked, starts, preset, progress=update)
     flat = [dataclasses.asdict(row.physics) | dataclasses.asdict(row) for row in rows]
@@ -78,9 +80,7 @@ def bench_physics(
     if json:
         report({"env": env, "starts": starts, "preset": preset, "rows": flat}, True)
         return
-    print("".join(f"{name:>20}" for name in flat[0]))
-    for row in flat:
-        print("".join(f"{value:20.4g}" for value in row.values()))
+    print_table(list(flat[0]), [[f"{value:.4g}" for value in row.values()] for row in flat])
 
 
 def report(result: dict, as_json: bool) -> None:
@@ -88,8 +88,7 @@ def report(result: dict, as_json: bool) -> None:
     if as_json:
         print(json.dumps(result))
     else:
-        for name, value in result.items():
-            print(f"{name:32} {value}")
+        print_table(("what", "value"), [(name, str(value)) for name, value in result.items()])
 
 
 def main() -> int:

@@ -19,7 +19,7 @@ from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.importing import import_object
 from dora.errors import InputError
-from dora.progress import PhaseProgress
+from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.sim.grasp_tests.bundle_maker import make_bundle
 from dora.sim.grasp_tests.generation import baselines, by_region, generate, summary, voting_summary
@@ -29,7 +29,7 @@ from dora.tools.task_ranking import rank_bundled_set, tasks_of, usable_in_task
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 BAD_INPUT = 2
-"""Exit status after input that a person can correct."""
+"""Exit status after an `InputError`."""
 ANY = "any"
 """Value of --region for a search without a region."""
 
@@ -105,7 +105,7 @@ def run(args: Args) -> None:
     out = args.out or Path("runs") / "grasps" / f"{obj.name}.safetensors"
     check_out(out)
     simulate = args.validate == "sapien"
-    with PhaseProgress() as phases:
+    with ProgressDisplay() as phases:
         generated = generate(obj, robot, args.num, args.seed, region, phases, simulate)
         report = summary(generated)
         searches = {}
@@ -127,7 +127,7 @@ def remake(args: Args) -> None:
         raise InputError("--make-bundle and --rank-in-task need --object, for example --object jug, and no --mesh.")
     name = args.object
     ids = tasks_of(load_object(name))
-    with PhaseProgress() as phases:
+    with ProgressDisplay() as phases:
         if args.make_bundle:
             print(make_bundle(name, args.seed, phases, usable_in_task(name)))
         if args.rank_in_task or ids:

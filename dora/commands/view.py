@@ -30,7 +30,7 @@ from dora.errors import InputError
 from dora.robot import RobotDescription, load_robot
 
 BAD_INPUT = 2
-"""Exit status after input that a person can correct."""
+"""Exit status after an `InputError`."""
 GRASPS = ".safetensors"
 """Suffix of a file of grasps."""
 

@@ -103,11 +103,6 @@ def matrix_from_rotation_vector(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "
     return matrix_from_quaternion(quaternion_from_rotation_vector(v))
 
 
-def rotation_vector_from_matrix(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Rotation vector with angle in [0, pi] of a rotation matrix."""
-    return rotation_vector_from_quaternion(quaternion_from_matrix(matrix))
-
-
 def rotation_angle(a: Float[Tensor, "*#batch 4"], b: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*out"]:
     """Angle between two unit quaternions, from 0 to pi [rad]."""
     return rotation_vector_from_quaternion(quaternion_multiply(quaternion_inverse(a), b)).norm(dim=-1)

@@ -1,7 +1,6 @@
 """Environment steps per second: ours against ManiSkill's own way of using several cores, on the same task."""
 
 import multiprocessing
-import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
 import dora  # noqa: F401  (registers Dora's tasks)
 from dora.errors import InputError
+from dora.parallel import run_cases
 from dora.sim import BACKEND, StepProfile
 
 REFERENCE_PROCESSES = (2, 4, 8)
@@ -75,7 +75,9 @@ def measure(env_id: str, num_envs: int, workers: int, seconds: float) -> EnvRepo
             raise InputError(f"{name} is {value}: it must be positive.")
     if env_id not in gym.registry:
         raise InputError(f"There is no task {env_id!r}: see gymnasium.registry for the ids.")
-    ours = _run_workers(env_id, num_envs, workers, seconds)
+    together = multiprocessing.get_context("spawn").Barrier(workers)
+    arguments = (env_id, num_envs, seconds, together)
+    ours = run_cases(_Measurement, arguments, range(workers), workers, chunk=1)  # the barrier gives each process one
     rate = sum(part.steps / part.seconds for part in ours)
     shares = {name: float(np.mean([part.shares[name] for part in ours])) for name in ours[0].shares}
     references = {count: _reference_rate(env_id, count, seconds) for count in REFERENCE_PROCESSES}
@@ -95,36 +97,24 @@ def measure(env_id: str, num_envs: int, workers: int, seconds: float) -> EnvRepo
     )
 
 
-def _run_workers(env_id: str, num_envs: int, workers: int, seconds: float) -> list[_Measured]:
-    context = multiprocessing.get_context("spawn")
-    barrier, results = context.Barrier(workers), context.SimpleQueue()
-    processes = [
-        context.Process(target=_work, args=(env_id, num_envs, seed, seconds, barrier, results), daemon=True)
-        for seed in range(workers)
-    ]
-    for process in processes:
-        process.start()
-    for process in processes:
-        process.join()
-        if process.exitcode:
-            raise RuntimeError(f"a measuring process ended with status {process.exitcode}")
-    return [results.get() for _ in processes]
+class _Measurement:
+    """Builds environments, and steps them as long as all processes of a barrier do."""
 
+    def __init__(self, env_id: str, num_envs: int, seconds: float, together: Any):
+        torch.set_num_threads(1)
+        self.env: Any = gym.make(env_id, num_envs=num_envs, sim_backend=BACKEND, **_TASK)
+        self.num_envs, self.seconds, self.together = num_envs, seconds, together
 
-def _work(env_id: str, num_envs: int, seed: int, seconds: float, barrier: Any, results: Any) -> None:
-    torch.set_num_threads(1)
-    env: Any = gym.make(env_id, num_envs=num_envs, sim_backend=BACKEND, **_TASK)
-    step = _random_stepper(env, num_envs, seed)
-    profile = StepProfile()
-    env.unwrapped.scene.px.profile = profile
-    for _ in range(_WARM_UP_STEPS):
-        step()
-    barrier.wait(_START_TIMEOUT)
-    profile.clear()
-    cpu = time.process_time()
-    rounds, elapsed = _repeat(step, seconds)
-    results.put(_Measured(rounds * num_envs, elapsed, time.process_time() - cpu, profile.shares()))
-    env.close()
+    def __call__(self, seed: int) -> _Measured:
+        step = _random_stepper(self.env, self.num_envs, seed)
+        self.env.unwrapped.scene.px.profile = profile = StepProfile()
+        for _ in range(_WARM_UP_STEPS):
+            step()
+        self.together.wait(_START_TIMEOUT)
+        profile.clear()
+        cpu = time.process_time()
+        rounds, elapsed = _repeat(step, self.seconds)
+        return _Measured(rounds * self.num_envs, elapsed, time.process_time() - cpu, profile.shares())
 
 
 def _random_stepper(env: Any, num_envs: int, seed: int) -> Callable[[], None]:
@@ -179,8 +169,3 @@ def _reference_rate(env_id: str, processes: int, seconds: float) -> float:
     finally:
         env.close()
     return rounds * processes / elapsed
-
-
-def all_cores() -> int:
-    """Number of processor cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,7 +1,7 @@
-"""How fast the grasp search is: candidates per second, where the time goes, how it grows, and against what.
+"""Speed of the grasp search: candidates per second, shares of its parts, growth with size, ratio to a reference.
 
-All times are processor times of one thread, after Numba has compiled (it keeps the result on disk). The reference is
-the same optimisation, energy and gradient, with forward kinematics of pytorch_kinematics and with closest points of
+All times are processor times of one thread, without Numba's compilation. The reference is the same
+optimisation, energy and gradient, with forward kinematics of pytorch_kinematics and with closest points of
 trimesh instead of the distance field, in the same process.
 """
 

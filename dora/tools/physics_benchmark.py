@@ -11,7 +11,7 @@ from dora.sim.grasp_tests.test_scene import Physics
 from dora.tasks import find_task, make_task
 
 TUNNELLED = 0.010
-"""Overlap at which a body is more inside another one than outside: about the radius of a finger or a handle [m]."""
+"""Overlap that counts as tunnelling: about the radius of a finger or a handle [m]."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class PhysicsRow:
         physics: the settings.
         success: share of the starts that succeed.
         stages: mean number of stages done.
-        overlap_median_mm, overlap_p95_mm: max_penetration overlap of an episode [mm], over the starts.
+        overlap_median_mm, overlap_p95_mm: median and 95th percentile over the starts of the largest overlap [mm].
         tunnelled: share of starts with an overlap of more than 10 mm.
         microseconds: processor time of one control step of one environment [us].
     """
@@ -56,13 +56,13 @@ def measure_physics(
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[PhysicsRow]:
-    """Executes the uncorrected reference from the same starts under each of the settings.
+    """Execute the uncorrected reference from the same starts under each of the settings.
 
     Args:
         env_id: a Dora id.
         settings: what to compare; rates must be multiples of the task's control frequency.
         starts: initial states, executed in one batch.
-        preset: how much they are randomised.
+        preset: preset of their randomisation.
         seed: of the initial states.
         progress: called with the settings done and their number.
 

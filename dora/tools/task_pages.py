@@ -6,6 +6,7 @@ Each page keeps its hand-written part; what stands between the two marks is repl
 import sys
 from pathlib import Path
 
+from dora.tables import markdown_table
 from dora.tasks import make_task, task_ids
 from dora.tasks.env.description import config_rows, limit_rows, observation_rows, stage_rows, term_rows
 from dora.tasks.env.env import DoraEnv
@@ -31,18 +32,17 @@ ACTION = (
 """What an action is."""
 
 
-def _table(rows: list[list[str]]) -> str:
-    lines = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
-
-
 def tables(task: DoraEnv) -> str:
     """Markdown tables of observation, action, stages, reward terms, limits and numbers of a guided task."""
     size = task.single_observation_space.shape[0]  # pyright: ignore[reportOptionalSubscript]
     sections = []
     for title, rows in TITLES.items():
         sections.append(f"### {title.format(size=size, actions=task.action_size)}")
-        sections.append(ACTION if rows is None else _table(rows(task)))
+        if rows is None:
+            sections.append(ACTION)
+        else:
+            head, *body = rows(task)
+            sections.append(markdown_table(head, body))
     return "\n\n".join(sections)
 
 
@@ -70,7 +70,7 @@ def preset_table() -> str:
         "pushes": pushes,
     }
     names = [f"`{name}`" for name in PRESETS]
-    return _table([["what", *names], *([what, *values] for what, values in rows.items())])
+    return markdown_table(["what", *names], [[what, *values] for what, values in rows.items()])
 
 
 def refreshed(page: str, generated: str) -> str:

@@ -1,7 +1,7 @@
-"""Rank candidates by executing them in their task: whole episodes of the scripted solution, randomised and judged.
+"""Ranking of candidates by executing them in their task: whole randomised episodes of the scripted solution.
 
-What a simulated hand without an arm holds (`dora.sim.grasp_tests.shake_test`) an arm cannot always reach, and what it
-reaches it does not always lift without pressing too deep. The task itself is the last judge.
+An arm cannot reach every grasp that a simulated hand without an arm holds (`dora.sim.grasp_tests.shake_test`), and some
+grasps that it reaches penetrate the object too deep when it is lifted. Episodes of the task show which ones succeed.
 """
 
 import math
@@ -23,17 +23,17 @@ from dora.tasks import find_task, make_task, task_ids
 from dora.tasks.env.env import DoraEnv
 
 FIRST_TRIES, MORE_TRIES = 6, 30
-"""Episodes per grasp of a ranking that makes a bundled set: of all grasps, then of the better ones."""
+"""Episodes per grasp when a bundled set is ranked: of all grasps, then of the better ones."""
 BETTER = 0.2
-"""Share of them that is tried again."""
+"""Share of the grasps that is executed again."""
 BATCH = 64
 """Episodes that run together."""
 CLEAN = 2 / 3
-"""Share of the task's penetration limit within which an execution counts: what barely passes will not do so again."""
+"""Share of the task's penetration limit within which an execution counts; the margin makes the outcome repeatable."""
 STARTS, USABLE = 64, 0.5
-"""Starts from which a grasp is asked to be within reach, and from which share of them."""
+"""Number of starts, and the share of them from which a usable grasp must be within reach."""
 SEED = 10_000
-"""First seed; far from those of training and evaluation, so that scores are not made on their starts."""
+"""First seed; training and evaluation use none of these."""
 
 
 def tasks_of(obj: AffordanceObject) -> list[str]:
@@ -44,11 +44,11 @@ def tasks_of(obj: AffordanceObject) -> list[str]:
 
 @dataclass(frozen=True)
 class TaskRanking:
-    """What executing c candidates showed.
+    """Result of executing c candidates.
 
     Attributes:
-        tries: episodes in which each one led; few or none where the arm seldom reaches it.
-        score: share of them that succeeded; 0 without a try.
+        tries: episodes in which each one was executed; few or none where the arm seldom reaches it.
+        score: share of them that succeeded; 0 without an episode.
     """
 
     tries: Int[Tensor, " c"]
@@ -56,7 +56,7 @@ class TaskRanking:
 
 
 class _Balanced:
-    """Gives every new episode the reachable candidate that has been tried least; among equals, in turn from `first`."""
+    """Selects for every new episode the reachable candidate with fewest tries; among equals, in turn from `first`."""
 
     def __init__(self, count: int, first: int = 0):
         self.tries = torch.zeros(count, dtype=torch.long)
@@ -84,7 +84,7 @@ class _Executor:
         self.task, self.count = make_task(env_id, BATCH, preset=preset, grasps=candidates), len(candidates)
 
     def __call__(self, case: tuple[int, int]) -> tuple[Int[Tensor, " c"], Int[Tensor, " c"]]:
-        """How often each candidate led, and how often with success, in a batch of (index, seed)."""
+        """How often each candidate was executed, and how often with success, in a batch of (index, seed)."""
         index, seed = case
         self.task.narrow = pick = _Balanced(self.count, index * BATCH)
         won = _executed(self.task, seed).cpu() & pick.possible
@@ -100,7 +100,7 @@ def rank_in_task(
     seed: int = SEED,
     processes: int | None = None,
 ) -> TaskRanking:
-    """Executes c candidates in a task, each about equally often, where f_reach lets them.
+    """Execute c candidates in a task, each about equally often, where f_reach allows it.
 
     Args:
         env_id: the task.
@@ -123,7 +123,7 @@ def rank_in_task(
 
 
 def _executed(task: DoraEnv, seed: int) -> Bool[Tensor, " n"]:
-    """Which of n episodes the scripted solution ends with success, without failing on the way, and cleanly."""
+    """Which of n episodes of the scripted solution succeed, without failure on the way and within `CLEAN`."""
     task.reset(seed=seed)
     failed = torch.zeros(task.num_envs, dtype=torch.bool, device=task.device)
     info: dict[str, Tensor] = {}
@@ -134,13 +134,13 @@ def _executed(task: DoraEnv, seed: int) -> Bool[Tensor, " n"]:
 
 
 def ranked(candidates: GraspCandidates, ranking: TaskRanking) -> GraspCandidates:
-    """The candidates with the scores of a ranking, best first; among equals, those that were reached more often."""
+    """The candidates with the scores of a ranking, best first; among equals, those with more tries."""
     order = torch.argsort(ranking.score + 1e-6 * ranking.tries, descending=True, stable=True)
     return replace(candidates, score=ranking.score).select(order)
 
 
 def usable_in_task(name: str | Path) -> Callable[[GraspCandidates], Bool[Tensor, " c"]] | None:
-    """A function that tells which grasps of an object its task can use at all, f_reach of the task's own.
+    """A function that tells which grasps of an object are usable in its task, by the task's f_reach.
 
     None where there is no such task, or the object stands on a table, which the search for grasps takes care of.
     """

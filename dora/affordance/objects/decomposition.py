@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import trimesh
 from jaxtyping import Float
 
 from dora.affordance.objects.solids import hull_of
+from dora.digests import digest_of
 from dora.errors import InputError
 from dora.files import read_tensors, write_tensors
 
@@ -133,11 +133,9 @@ def _run(mesh: trimesh.Trimesh, threshold: float) -> list[trimesh.Trimesh]:
 
 
 def _digest(mesh: trimesh.Trimesh, threshold: float) -> str:
-    """sha256 of everything on which the hulls depend."""
-    digest = hashlib.sha256(f"{FORMAT} {threshold} {HULL_VERTICES} {ITERATIONS} {DEPTH}".encode())
-    digest.update(np.array(mesh.vertices, np.float64).tobytes())
-    digest.update(np.array(mesh.faces, np.int64).tobytes())
-    return digest.hexdigest()
+    """sha256 of all on which the hulls depend."""
+    settings = [FORMAT, threshold, HULL_VERTICES, ITERATIONS, DEPTH]
+    return digest_of([*settings, np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)])
 
 
 def _save(path: Path, hulls: Sequence[trimesh.Trimesh]) -> None:

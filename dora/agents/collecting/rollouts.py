@@ -3,12 +3,10 @@
 import copy
 import functools
 import os
-import signal
 import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +17,12 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from dora.agents.collecting.task_env import Task, TaskEnv, TaskFactory
 from dora.agents.learners.networks import Policy
 from dora.errors import InputError
+from dora.parallel import sigint_blocked
 
 SHUTDOWN_SECONDS = 10.0
-"""Time after which workers that have not ended are killed [s]."""
+"""Workers that have not ended after this time are killed [s]."""
 LESS_URGENT = 5
-"""Niceness of workers beside a busy learner, for which all of them wait [1]."""
+"""Niceness of workers that collect while the learner is busy: the learner has priority."""
 
 
 class WorkerTaskEnv(TaskEnv):
@@ -68,7 +67,7 @@ class Rollouts:
 
     Args:
         make_task: makes one task batch; called once in each worker.
-        policy: acts; the workers use copies, brought up to date before each batch is begun.
+        policy: acts; the workers use copies, which get its weights before each batch.
         workers: worker processes, or 0 to collect in this process.
         rollout: control steps per environment and batch.
         seeds: one per worker (one if `workers` is 0), for its tasks and its exploration.
@@ -142,12 +141,12 @@ class Rollouts:
             return batch
 
     def _begin(self, waiting: ThreadPoolExecutor) -> Future[TensorDictBase]:
-        """Lets the workers collect, with the present policy, while a thread waits for them."""
+        """Start a batch with the present policy; a thread waits for it."""
         self._push()
         return waiting.submit(next, self._iterator)
 
     def _push(self) -> None:
-        """Gives the workers the present weights and normaliser of the policy."""
+        """Give the workers the present weights and normaliser of the policy."""
         if isinstance(self._collector, MultiSyncCollector):
             self._acting.load_state_dict(self._policy.state_dict())
             self._collector.update_policy_weights_()
@@ -178,14 +177,3 @@ class Rollouts:
                         raise InputError(message) from None
                     raise RuntimeError(f"worker {index} failed with {kind}: {message}") from error
             raise
-
-
-@contextmanager
-def sigint_blocked() -> Iterator[None]:
-    """Block Ctrl-C while workers start: they keep the mask for good, this process gets the signal later."""
-    resource_tracker.ensure_running()  # unblocks SIGINT itself when it starts
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

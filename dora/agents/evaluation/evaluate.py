@@ -1,4 +1,4 @@
-"""Evaluation: episodes on fixed seeds, with a policy that does not explore."""
+"""Evaluation: statistics of episodes on fixed seeds, with a policy that does not explore."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from torch import Tensor
 from dora.agents.collecting.task_env import EpisodeColumns, TaskEnv
 
 PERIODIC_SEED = 1_000_000_000
-"""First episode seed of evaluations during training; training seeds are below."""
+"""Seed of the first episode of evaluations during training; all training seeds are smaller."""
 FINAL_SEED = 1_500_000_000
-"""First episode seed of the evaluation that a result reports."""
+"""Seed of the first episode of the evaluation that `result.json` reports."""
 
 Act = Callable[[Float[Tensor, "n o"]], Float[Tensor, "n a"]]
 
 
 def no_correction(action_size: int) -> Act:
-    """A policy whose action is always zero: with guidance it follows the prior."""
+    """A policy whose action is always zero: with guidance, the uncorrected reference."""
 
     def act(observation: Float[Tensor, "n o"]) -> Float[Tensor, "n a"]:
         return torch.zeros(len(observation), action_size)
@@ -32,7 +32,7 @@ def no_correction(action_size: int) -> Act:
 class Evaluation:
     """Statistics of evaluation episodes, one row each.
 
-    columns: what the columns of `table` are.
+    columns: names of the columns of `table`.
     table: (E, K) values at the end of each episode.
     """
 
@@ -64,14 +64,14 @@ class Evaluation:
         }
 
     def penetration_mm(self, quantile: float = 1.0) -> float | None:
-        """Quantile over the episodes of their deepest penetration, mm; None if the task reports none."""
+        """Quantile over the episodes of their largest penetration [mm]; None if the task reports none."""
         if "penetration_mm" not in self.columns.highest:
             return None
         return float(self.values("penetration_mm").quantile(quantile))
 
     @property
     def penetration_p95_mm(self) -> float | None:
-        """95th percentile over the episodes of their deepest penetration, mm; None if the task reports none."""
+        """95th percentile over the episodes of their largest penetration [mm]; None if the task reports none."""
         return self.penetration_mm(0.95)
 
     def rows(self) -> tuple[tuple[str, ...], list[list[Any]]]:
@@ -85,7 +85,7 @@ class Evaluation:
 def run_batch(env: TaskEnv, act: Act, first_seed: int) -> Float[Tensor, "n k"]:
     """One episode per environment, with seeds first_seed, first_seed + 1, ...; their rows of an evaluation's table.
 
-    Rows that end early idle until all end.
+    Environments whose episode has ended go on stepping, uncounted, until all have ended.
     """
     n = env.batch_size[0]
     data = env.restart([first_seed + row for row in range(n)])
@@ -101,7 +101,7 @@ def run_batch(env: TaskEnv, act: Act, first_seed: int) -> Float[Tensor, "n k"]:
 
 
 def outcome(evaluation: Evaluation, zero: Evaluation | None) -> str:
-    """What is told of a policy's last evaluation, and of no correction's if there is a prior, in one line."""
+    """One line about the last evaluation of a policy and, if there is a prior, of zero correction."""
     text = f"success {evaluation.success_rate:.3f}"
     if zero is not None:
         text += f", without any correction {zero.success_rate:.3f}"

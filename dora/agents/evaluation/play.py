@@ -1,5 +1,6 @@
-"""A trained policy at work: evaluation of a checkpoint, and films."""
+"""Evaluation of a checkpoint, and films of a policy."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,7 @@ from dora.agents.learners.learner import make_learner
 from dora.agents.learners.networks import Policy
 
 FRAMES_PER_SECOND = 20
-"""Frame rate of a film if the task does not say its control frequency [1/s]."""
+"""Rate of a film of a task that does not say its control frequency [Hz]."""
 
 
 def checkpoint_path(path: Path) -> Path:
@@ -44,11 +45,14 @@ def evaluate_checkpoint(
 ) -> tuple[Checkpoint, Evaluation, Evaluation | None]:
     """Evaluate a checkpoint on the seeds of final evaluations; with guidance also no correction.
 
+    The networks are those of the checkpoint, whatever `config.learner` says.
+
     Raises:
         InputError: if it is no checkpoint or belongs to another task, learner or guidance.
     """
     checkpoint = read_checkpoint(path)
-    evaluators = Evaluators(functools.partial(make_task, config.eval_envs), config)
+    settings = dataclasses.replace(config, learner=checkpoint.config.learner)
+    evaluators = Evaluators(functools.partial(make_task, config.eval_envs), settings)
     try:
         check_belongs(checkpoint, path, config, evaluators.sizes, exactly=False)
         return checkpoint, *evaluators.final(load_policy(checkpoint, path))
@@ -90,6 +94,6 @@ def _frames(task: Any, act: Act, seed: int, low: Tensor, high: Tensor) -> list[n
 
 
 def _picture(image: Any) -> UInt8[np.ndarray, "h w 3"]:
-    """What `render` returned as one (h, w, 3) picture of bytes."""
+    """The image that `render` returned, as bytes."""
     array = image.cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
     return array.reshape(array.shape[-3:]).astype(np.uint8)

@@ -15,7 +15,7 @@ from dora.agents.learners.networks import Critic, Normaliser, Policy, TanhActor,
 from dora.agents.learners.replay import Replay
 
 ACTOR_PERIOD = 2
-"""Gradient steps of the critics per step of actor and temperature."""
+"""Gradient steps of the critics per gradient step of actor and temperature."""
 
 
 class SAC:

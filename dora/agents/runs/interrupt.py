@@ -1,4 +1,4 @@
-"""Ctrl-C at a moment that suits the training loop."""
+"""Ctrl-C as a request that the training loop checks."""
 
 import signal
 from types import FrameType

@@ -5,25 +5,27 @@ from pathlib import Path
 
 from torch.utils.tensorboard import SummaryWriter
 
+from dora.tables import markdown_table
+
 TAGS: dict[str, str] = {
     "evaluation/success_rate": "share of evaluation episodes (fixed seeds, greedy) that end in success",
     "evaluation/return_mean": "mean sum of rewards of evaluation episodes",
-    "evaluation/penetration_p95_mm": "95th percentile of the deepest penetration of evaluation episodes, mm",
+    "evaluation/penetration_p95_mm": "95th percentile of the largest penetration of evaluation episodes [mm]",
     "evaluation/stage/<name>": "share of evaluation episodes that reached the stage",
     "episode/success_rate": "share of this iteration's training episodes that end in success",
     "episode/return_mean": "mean sum of rewards of those episodes",
-    "episode/length_mean": "mean length of those episodes, control steps",
+    "episode/length_mean": "mean length of those episodes [control steps]",
     "episode/reward/<term>": "mean per control step of the reward term over those episodes, weight included",
     "episode/stage/<name>": "share of those episodes that reached the stage",
-    "episode/penetration_mm": "mean over those episodes of their deepest penetration, mm",
+    "episode/penetration_mm": "mean over those episodes of their largest penetration [mm]",
     "episode/<other>": "mean per control step of any other value that the task logs",
     "loss/policy": "PPO: clipped surrogate objective, negative",
     "loss/value": "PPO: squared error of the value times its weight",
     "loss/bound": "PPO: mean squared excess of mean actions over [-1, 1], without its weight",
     "loss/qvalue": "SAC: squared Bellman error, summed over both critics",
     "loss/actor": "SAC: temperature times log probability minus the smaller critic, without the prior's share",
-    "learner/entropy": "entropy of the policy, nats",
-    "learner/kl": "PPO: divergence from the policy that collected the batch, last epoch, nats",
+    "learner/entropy": "entropy of the policy [nats]",
+    "learner/kl": "PPO: divergence from the policy that collected the batch, last epoch [nats]",
     "learner/clip_fraction": "PPO: share of transitions whose probability ratio is clipped",
     "learner/learning_rate": "learning rate (PPO adapts it to the divergence)",
     "learner/grad_norm": "norm of the gradient before clipping (of the actor)",
@@ -46,8 +48,7 @@ LOSSES = frozenset(tag.removeprefix("loss/") for tag in TAGS if tag.startswith("
 
 def tags_table() -> str:
     """The tags as a Markdown table."""
-    rows = [f"| `{tag}` | {meaning} |" for tag, meaning in TAGS.items()]
-    return "\n".join(["| tag | meaning |", "|---|---|", *rows])
+    return markdown_table(("tag", "meaning"), [(f"`{tag}`", meaning) for tag, meaning in TAGS.items()])
 
 
 class RunLog:

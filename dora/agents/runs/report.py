@@ -7,9 +7,11 @@ from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, stdev
+from urllib.parse import quote
 
 from dora.errors import InputError
 from dora.files import write_bytes
+from dora.tables import html_page, markdown_table
 
 COLOURS = {
     ("ppo", "affordance"): "#c0392b",
@@ -25,6 +27,24 @@ HEADINGS = (
     "steps", "minutes",
 )  # fmt: skip
 """Of the table."""
+PAGE = """\
+<!doctype html>
+<meta charset="utf-8">
+<title>Dora runs</title>
+<style>body{font-family:sans-serif;margin:2em}td,th{text-align:left;padding:.2em .8em;border-bottom:1px solid #ccc}
+img{max-width:100%}</style>
+<h1>Runs in {{ root }}</h1>
+<table>
+<tr>{% for name in head %}<th>{{ name }}</th>{% endfor %}</tr>
+{%- for row in rows %}
+<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+{%- endfor %}
+</table>
+{%- for figure in figures %}
+<p><img src="{{ figure | urlencode }}"></p>
+{%- endfor %}
+"""
+"""Template of `report.html`."""
 SECONDS_PER_MINUTE = 60.0
 """Seconds per minute [s]."""
 
@@ -88,24 +108,30 @@ def _zero_rates(results: list[dict]) -> list[float]:
     return [r["zero_success_rate"] for r in results if r["zero_success_rate"] is not None]
 
 
-def tables(runs: list[Run]) -> str:
-    """Markdown: one row per group of runs (`Run.group`), mean and deviation over seeds."""
+def table_rows(runs: list[Run]) -> list[list[str]]:
+    """Cells under `HEADINGS`: one row per group of runs (`Run.group`), mean and deviation over seeds."""
     groups: dict[Group, list[dict]] = defaultdict(list)
     for run in runs:
         groups[run.group].append(run.result)
-    lines = ["| " + " | ".join(HEADINGS) + " |", "|" + " --- |" * len(HEADINGS)]
+    rows = []
     for (env, preset, agent, guidance, thousands), results in sorted(groups.items()):
         zero = [100 * rate for rate in _zero_rates(results)]
-        cells = [
+        rows.append([
             env, preset, agent.upper(), guidance, str(len(results)),
-            f"**{_spread([100 * r['success_rate'] for r in results])}**",
+            _spread([100 * r["success_rate"] for r in results]),
             _spread(zero) if zero else "-",
             _spread([r["penetration_p95_mm"] for r in results]),
             f"{thousands}k",
             _spread([r["wall_seconds"] / SECONDS_PER_MINUTE for r in results]),
-        ]  # fmt: skip
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        ])  # fmt: skip
+    return rows
+
+
+def tables(runs: list[Run]) -> str:
+    """`table_rows` as Markdown, success in bold; names are escaped."""
+    at = HEADINGS.index("success %")
+    rows = [[html.escape(cell) for cell in row] for row in table_rows(runs)]
+    return markdown_table(HEADINGS, [[*row[:at], f"**{row[at]}**", *row[at + 1 :]] for row in rows]) + "\n"
 
 
 def draw_curves(runs: list[Run], env: str, preset: str, path: Path) -> None:
@@ -152,18 +178,12 @@ def write_report(root: Path, out: Path) -> list[Path]:
     """Writes `tables.md`, a figure for each task and preset, and `report.html` into `out`; returns their paths."""
     runs = find_runs(root)
     out.mkdir(parents=True, exist_ok=True)
-    text = tables(runs)
-    write_bytes(out / "tables.md", text.encode())
+    write_bytes(out / "tables.md", tables(runs).encode())
     figures = []
     for env, preset in sorted({run.group[:2] for run in runs}):
-        path = out / (f"{env}.png" if preset == DEFAULT_PRESET else f"{env}-{preset}.png")
-        draw_curves(runs, env, preset, path)
-        figures.append(path)
-    pictures = "".join(f'<p><img src="{html.escape(p.name)}" style="max-width:100%"></p>' for p in figures)
-    rows = [line.strip("|").split("|") for line in text.splitlines() if not line.startswith("| ---")]
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(c.strip(' *'))}</td>" for c in row) + "</tr>" for row in rows)
-    style = "body{font-family:sans-serif;margin:2em}td{padding:.2em .8em;border-bottom:1px solid #ccc}"
-    page = f"<!doctype html><meta charset=utf-8><title>Dora runs</title><style>{style}</style>"
-    page += f"<h1>Runs in {html.escape(root.name)}</h1><table>{body}</table>{pictures}"
+        name = env if preset == DEFAULT_PRESET else f"{env}-{preset}"
+        figures.append(out / f"{quote(name, safe='')}.png")
+        draw_curves(runs, env, preset, figures[-1])
+    page = html_page(PAGE, root=root.name, head=HEADINGS, rows=table_rows(runs), figures=[p.name for p in figures])
     write_bytes(out / "report.html", page.encode())
     return [out / "tables.md", out / "report.html", *figures]

@@ -30,13 +30,13 @@ from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.runs.interrupt import Interrupt
 from dora.agents.learners.learner import Learner, make_learner
 from dora.agents.runs.logging import RunLog
-from dora.agents.runs.progress import ProgressReport
 from dora.agents.runs.run_folder import RunFolder, make_result
+from dora.progress import ProgressDisplay
 
 TRAINING_SEEDS = 1_000_000_000
-"""Bound of the seeds: those of training are below, those of evaluation above."""
+"""Seeds of training are below this number, those of evaluation are not."""
 RECENT = 200
-"""Number of training episodes over which the shown success rate is taken."""
+"""Number of latest training episodes over which the displayed success rate is taken."""
 
 
 def seeds_for(seed: int, step: int, count: int) -> list[int]:
@@ -47,7 +47,7 @@ def seeds_for(seed: int, step: int, count: int) -> list[int]:
 
 @dataclass
 class Counters:
-    """Where a run stands; what a checkpoint keeps besides tensors."""
+    """Progress of a run: what a checkpoint keeps besides tensors."""
 
     env_steps: int = 0
     wall_seconds: float = 0.0
@@ -101,7 +101,7 @@ class Trainer:
             log = RunLog(self.folder.path, first_step)
             finished = False
             try:
-                with self._rollouts() as rollouts, ProgressReport(self.config.total_steps) as progress:
+                with self._rollouts() as rollouts, ProgressDisplay() as progress:
                     self._train(rollouts, log, progress, interrupt)
                 self.save()
                 progress.say(f"last evaluation of the best policy, on {self.config.final_episodes} episodes ...")
@@ -146,9 +146,9 @@ class Trainer:
             torch.manual_seed(self._exploration_seed)
         return rollouts
 
-    def _train(self, rollouts: Rollouts, log: RunLog, progress: ProgressReport, interrupt: Interrupt) -> None:
+    def _train(self, rollouts: Rollouts, log: RunLog, progress: ProgressDisplay, interrupt: Interrupt) -> None:
         counters, config = self.counters, self.config
-        saved = time.monotonic()
+        show, saved = progress.bar("training"), time.monotonic()
         while counters.env_steps < config.total_steps:
             interrupt.check()
             start = time.perf_counter()
@@ -169,8 +169,13 @@ class Trainer:
                 self.save()
                 saved = time.monotonic()
             mean_rate = counters.env_steps / max(counters.wall_seconds, 1e-9)
-            best = counters.curve[-1][2] if counters.curve else None
-            progress.update(counters.env_steps, mean_rate, self._training_success(), best)
+            show(counters.env_steps, config.total_steps, mean_rate, self._status(mean_rate))
+
+    def _status(self, rate: float) -> str:
+        """Environment steps per second and the success rates in training and in the last evaluation."""
+        rates = self._training_success(), self.counters.curve[-1][2] if self.counters.curve else None
+        training, evaluated = ("-" if x is None else f"{x:.2f}" for x in rates)
+        return f"{rate:,.0f} steps/s, success {training} (evaluated {evaluated})"
 
     def _spend(self, what: str, seconds: float) -> None:
         self.counters.seconds[what] += seconds
@@ -201,8 +206,8 @@ class Trainer:
     def _evaluation_is_due(self) -> bool:
         return self.counters.env_steps >= self.counters.next_evaluation
 
-    def _evaluate(self, log: RunLog, progress: ProgressReport, interrupt: Interrupt) -> bool:
-        """Evaluate, keep the policy if it is the best so far, and tell whether the run may end."""
+    def _evaluate(self, log: RunLog, progress: ProgressDisplay, interrupt: Interrupt) -> bool:
+        """Evaluate and keep the policy if it is the best so far; returns whether the run may end."""
         counters, config = self.counters, self.config
         start = time.perf_counter()
         evaluation = self._evaluators.run(self.learner.policy, config.eval_episodes, PERIODIC_SEED, interrupt.check)
@@ -232,11 +237,11 @@ class Trainer:
         return counters.reached >= 2
 
     def _keep_as_best(self) -> None:
-        """Write what it takes to act, without critics."""
+        """Write the networks that act, without critics."""
         self._checkpoint(pack_modules(self.learner.policy.modules_by_name)).write(self.folder.best)
 
     def _final_evaluation(self, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
-        """Evaluate the best policy, and no correction, on seeds that chose nothing."""
+        """Evaluate the best policy, and zero correction, on seeds that did not select it."""
         start = time.perf_counter()
         if self.folder.best.exists():
             best = read_checkpoint(self.folder.best)

@@ -22,7 +22,7 @@ from dora.affordance.reach.feasibility_table import Grid, poses
 from dora.affordance.search.optimise import Settings, optimise
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
-from dora.progress import PhaseProgress
+from dora.progress import ProgressDisplay
 from dora.robot import RobotDescription, load_robot
 from dora.sim.grasp_tests.lift_test import Execution, rank
 from dora.sim.grasp_tests.shake_test import validate
@@ -51,7 +51,7 @@ Usable = Callable[[GraspCandidates], Bool[Tensor, " c"]]
 """Function that returns the mask (c,) of grasps that a task can use."""
 
 
-def make_bundle(name: str, seed: int, phases: PhaseProgress, usable: Usable | None = None) -> Path:
+def make_bundle(name: str, seed: int, phases: ProgressDisplay, usable: Usable | None = None) -> Path:
     """Make and write the bundled set of an object; returns the path of its file.
 
     Args:
@@ -73,7 +73,7 @@ class SetMaker:
     """Makes the bundled set of one object for one robot; `usable` as in `make_bundle`."""
 
     def __init__(
-        self, obj: AffordanceObject, robot: RobotDescription, phases: PhaseProgress, usable: Usable | None = None
+        self, obj: AffordanceObject, robot: RobotDescription, phases: ProgressDisplay, usable: Usable | None = None
     ) -> None:
         self.obj, self.robot, self.phases, self.usable = obj, robot, phases, usable
         self.reach = Reach(robot, obj, start=obj.start_posture)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Iterable
@@ -21,10 +20,11 @@ from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.search.cache import map_of
 from dora.affordance.search.energies import Weights
 from dora.affordance.search.optimise import Settings, optimise
+from dora.digests import digest_of
 from dora.parallel import warm_up
-from dora.progress import PhaseProgress
+from dora.progress import ProgressDisplay
 from dora.robot import RobotDescription
-from dora.sim.grasp_tests.shake_test import Validation, validate
+from dora.sim.grasp_tests.shake_test import ShakeTest, Validation, validate
 
 MILLIMETRES = 1000.0
 """Millimetres per metre [1]."""
@@ -78,7 +78,7 @@ def generate(
     num: int,
     seed: int,
     region: str | None,
-    phases: PhaseProgress,
+    phases: ProgressDisplay,
     simulate: bool = True,
     settings: Settings | None = None,
     test_settings: GraspTestSettings = STANDARD,
@@ -104,7 +104,7 @@ def generate(
     settings = settings or Settings()
     start = time.perf_counter()
     if simulate:
-        warm_up()
+        warm_up(ShakeTest)
     report = phases.phase(f"{name}: search", "candidates", scale=1 / settings.iterations)
     found = optimise(obj, robot, num, seed, region, settings, progress=report)
     between = time.perf_counter()
@@ -160,7 +160,7 @@ def baselines(
     num: int,
     seed: int,
     region: str | None,
-    phases: PhaseProgress,
+    phases: ProgressDisplay,
     simulate: bool = True,
 ) -> dict[str, dict[str, Any]]:
     """Summaries of searches with the settings in `BASELINES`, by name; arguments as for `generate`."""
@@ -171,7 +171,7 @@ def baselines(
 
 
 def by_region(
-    obj: AffordanceObject, robot: RobotDescription, num: int, seed: int, region: str | None, phases: PhaseProgress
+    obj: AffordanceObject, robot: RobotDescription, num: int, seed: int, region: str | None, phases: ProgressDisplay
 ) -> dict[str, Generated]:
     """Validated grasps of a search without a region ("any") and of one for each region other than `region`, by name.
 
@@ -226,9 +226,8 @@ def _classes(candidates: GraspCandidates, voted: Int[Tensor, " c"], obj: Afforda
 
 
 def origin_digest(candidates: GraspCandidates) -> str:
-    """sha256 of everything on which candidates depend: object, robot and settings."""
-    origin = [candidates.digest, candidates.robot_digest, candidates.settings]
-    return hashlib.sha256(json.dumps(origin).encode()).hexdigest()
+    """sha256 of what candidates depend on: object, robot and settings."""
+    return digest_of([candidates.digest, candidates.robot_digest, candidates.settings])
 
 
 def _share(mask: Tensor | None) -> float | None:

@@ -34,8 +34,8 @@ ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
 
 
 def print_report(report: dict[str, Any], console: Console | None = None) -> None:
-    """Print the table of a report, with a column per entry of "baselines" and "by_region", and the table of votes."""
-    console = console or Console()
+    """Print a summary and, beside it, those that it holds under "baselines" and "by_region"; below, the votes."""
+    console = console or Console(markup=False)
     beside = report.get("by_region", {}) | report.get("baselines", {})
     table = Table(title=f"{report['object']}, {report['region'] or 'any region'}, {report['robot']}")
     table.add_column()

@@ -1,0 +1,48 @@
+"""Tables as Markdown, HTML pages and text on a terminal: by jinja2, which escapes what comes from files, and rich."""
+
+import io
+from collections.abc import Sequence
+
+import jinja2
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+_PLAIN, _ESCAPED = jinja2.Environment(), jinja2.Environment(autoescape=True)
+_MARKDOWN = _PLAIN.from_string("""\
+| {{ head | join(" | ") }} |
+|{{ " --- |" * head | length }}
+{%- for row in rows %}
+| {% for cell in row %}{{ cell | replace("|", "\\\\|") }}{{ " | " if not loop.last }}{% endfor %} |
+{%- endfor %}""")
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table, without a line break at its end. Cells are Markdown, but for bars, which are escaped."""
+    return _MARKDOWN.render(head=head, rows=rows)
+
+
+def html_page(template: str, **values: object) -> str:
+    """A page from a jinja2 template; values are escaped."""
+    return _ESCAPED.from_string(template).render(values)
+
+
+def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table to standard output."""
+    Console(markup=False).print(_table(head, rows, Table()))
+
+
+def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table as plain text, as wide as its content, without a line break at its end."""
+    console = Console(markup=False, width=10_000, file=io.StringIO(), color_system=None)
+    with console.capture() as captured:
+        console.print(_table(head, rows, Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False)))
+    return "\n".join(line.rstrip() for line in captured.get().splitlines()).strip("\n")
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], table: Table) -> Table:
+    for name in head:
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    return table

@@ -1,0 +1,87 @@
+"""Worker processes: results in order, errors that reach the caller, and no process left behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dora.parallel import WorkerPool, run_cases
+
+CASES = list(range(11))
+
+
+def make_square(offset: int) -> Callable[[int], tuple[int, int]]:
+    """A task that squares, and names its process."""
+    return lambda case: (case * case + offset, os.getpid())
+
+
+def make_deadly() -> Callable[[int], int]:
+    """A task that ends its process."""
+    return lambda case: os._exit(3)
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3])
+def test_results_come_in_the_order_of_the_cases_whoever_does_them(processes: int):
+    told = []
+    found = run_cases(make_square, (7,), CASES, processes, lambda *state: told.append(state), chunk=2)
+    assert [value for value, _ in found] == [case * case + 7 for case in CASES]
+    assert told[-1] == (len(CASES), len(CASES))
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    assert len({process for _, process in found}) <= processes
+    assert (os.getpid() in {process for _, process in found}) == (processes == 1)
+
+
+def test_this_process_does_its_share_and_the_others_keep_their_task():
+    with WorkerPool(make_square, (0,), 1) as pool:
+        for _ in range(2):
+            found = pool.map(CASES, make_square(0))
+            assert [value for value, _ in found] == [case * case for case in CASES]
+            assert [process == os.getpid() for _, process in found] == [case % 2 == 0 for case in CASES]
+
+
+def test_a_process_that_dies_is_told_in_one_sentence():
+    with pytest.raises(RuntimeError, match="a worker process died"):
+        run_cases(make_deadly, (), CASES, processes=2)
+
+
+SCRIPT = """
+import time
+from dora.parallel import run_cases
+
+def make():
+    def task(seconds):
+        print("busy", flush=True)
+        time.sleep(seconds)
+    return task
+
+if __name__ == "__main__":
+    run_cases(make, (), [100.0] * 6, processes=2, chunk=1)
+"""
+
+
+@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_the_process_that_started_them(tmp_path: Path, kill: signal.Signals):
+    (tmp_path / "script.py").write_text(SCRIPT)
+    process = subprocess.Popen(
+        [sys.executable, str(tmp_path / "script.py")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert [process.stdout.readline() for _ in range(2)] == ["busy\n"] * 2
+    if kill is signal.SIGINT:
+        os.killpg(process.pid, kill)  # as a terminal does
+    else:
+        process.kill()
+    started = time.monotonic()
+    _, errors = process.communicate(timeout=20)  # until all who write there have ended
+    assert time.monotonic() - started < 5
+    assert process.returncode == -kill
+    assert errors.count("Traceback") == (kill is signal.SIGINT), errors
