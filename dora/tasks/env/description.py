@@ -3,9 +3,8 @@
 from collections.abc import Iterator
 from typing import Any
 
-from tabulate import tabulate
-
 from dora.configs import plain
+from dora.tables import text_table
 
 Rows = list[list[str]]
 """Cells of a table, a list for each row; the first row is the head."""
@@ -81,7 +80,8 @@ def describe(env: Any) -> str:
     head = f"{type(env).__name__}: {env.num_envs} environments, guidance {parts}"
     if not hasattr(env, "arms"):
         return head
-    tables = [
-        f"{title}\n{tabulate(rows(env), headers='firstrow', disable_numparse=True)}" for title, rows in TABLES.items()
-    ]
-    return "\n\n".join([head, *(table.replace("`", "") for table in tables)])
+    sections = [head]
+    for title, rows in TABLES.items():
+        first, *others = ([cell.replace("`", "") for cell in row] for row in rows(env))
+        sections.append(f"{title}\n{text_table(first, others)}")
+    return "\n\n".join(sections)
