@@ -124,7 +124,7 @@ class CubeTask(Task):
     def candidates(self, arm: str) -> GraspCandidates:
         return hand_made_candidates()
 
-    def start_grid(self) -> Grid:
+    def start_grid(self, arm: str) -> Grid:
         return Grid(self.config.centre, (self.config.spread,) * 2)
 
     def build(self, scene: TaskScene, name: str, scale: Float[np.ndarray, " n"]) -> Actor:
@@ -147,7 +147,7 @@ class CubeTask(Task):
     def place(self, scene: TaskScene, rows: Tensor, u: Tensor) -> None:
         """The cube stands on a face, somewhere in the area, at any yaw."""
         reachable = partial(self.reachable, scene.arms["arm"])
-        scene.object.set_pose(Pose.create_from_pq(*standing(u, scene.half[rows, 2], self.start_grid(), reachable)))
+        scene.object.set_pose(Pose.create_from_pq(*standing(u, scene.half[rows, 2], self.start_grid("arm"), reachable)))
 
 
 OBSERVATIONS: dict[str, Entry] = {

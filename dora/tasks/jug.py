@@ -155,7 +155,7 @@ class JugTask(Task):
     def make_reference(self, scene: TaskScene, arm: str) -> Reference:
         return GraspReference(scene.num_envs, self.config.dt, scene.device, self.config.reference)
 
-    def start_grid(self) -> Grid:
+    def start_grid(self, arm: str) -> Grid:
         return Grid(self.config.centre, (self.config.spread,) * 2)
 
     def build(self, scene: TaskScene, name: str, scale: Float[np.ndarray, " n"]) -> Actor:
@@ -170,7 +170,7 @@ class JugTask(Task):
         """The jug stands upright, somewhere in the area, at any yaw."""
         height = jug().support * scene.scale[rows, 0]
         reachable = partial(self.reachable, scene.arms["arm"])
-        scene.object.set_pose(Pose.create_from_pq(*standing(u, height, self.start_grid(), reachable)))
+        scene.object.set_pose(Pose.create_from_pq(*standing(u, height, self.start_grid("arm"), reachable)))
 
 
 OBSERVATIONS: dict[str, Entry] = {

@@ -110,7 +110,7 @@ class DoraEnv(BaseEnv):
             *args,
             num_envs=num_envs,
             robot_uids=options.robots if several else options.robots[0],  # pyright: ignore[reportArgumentType]
-            control_mode=(options.control_mode,) * len(options.robots) if several else options.control_mode,  # pyright: ignore[reportArgumentType]
+            control_mode=options.control_mode,
             sim_backend=options.sim_backend,
             render_backend=options.render_backend,
             render_mode=render_mode,

@@ -124,7 +124,7 @@ class TaskScene:
             size = int(np.prod(agent.single_action_space.shape or ()))
             residual = ResidualAction(self.num_envs, size, self.config.residual, self.device)
             guide = Guide(parts, choice, task.make_reference(self, name), residual)
-            self.arms[name] = Arm(name, spec, agent, guide, task.start_grid(), tables)
+            self.arms[name] = Arm(name, spec, agent, guide, task.start_grid(name), tables)
 
     def make_reader(self, task: Task) -> None:
         """Makes the reader, when arms and objects are built."""

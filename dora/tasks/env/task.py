@@ -86,8 +86,8 @@ class Task(ABC):
         """What leads the hand of an arm along its chosen candidate; called once per scene."""
         return GraspReference(scene.num_envs, self.config.dt, scene.device)
 
-    def start_grid(self) -> Grid | None:
-        """Where the objects may stand at the start, for the table of f_reach; None where they do not stand."""
+    def start_grid(self, arm: str) -> Grid | None:
+        """Where the object of an arm may stand at the start, for the table of f_reach; None where it does not stand."""
         return None
 
     def masses(self, name: str, nominal: Float[Tensor, " b"], u: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
