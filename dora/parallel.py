@@ -24,6 +24,7 @@ CHUNK = 4
 POLL_SECONDS = 0.2
 """Longest time between two calls of `check` while workers are busy [s]."""
 DIED = "a worker process died (a crash in native code, or too little memory): run with one process to see why."
+"""Message of the error after the death of a worker."""
 
 
 def available_cores() -> int:

@@ -9,12 +9,14 @@ from rich.console import Console
 from rich.table import Table
 
 _PLAIN, _ESCAPED = jinja2.Environment(), jinja2.Environment(autoescape=True)
+"""Templates of text, and of pages in which values are escaped."""
 _MARKDOWN = _PLAIN.from_string("""\
 | {{ head | join(" | ") }} |
 |{{ " --- |" * head | length }}
 {%- for row in rows %}
 | {% for cell in row %}{{ cell | replace("|", "\\\\|") }}{{ " | " if not loop.last }}{% endfor %} |
 {%- endfor %}""")
+"""A Markdown table."""
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

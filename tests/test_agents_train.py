@@ -29,7 +29,8 @@ from dora.agents.runs.trainer import Trainer
 from dora.errors import InputError
 
 RESULT_KEYS = [
-    *("env", "agent", "guidance", "seed", "env_steps", "wall_seconds", "env_steps_per_second", "episodes"),
+    *("env", "agent", "guidance", "preset", "seed", "commit", "task_config"),
+    *("env_steps", "wall_seconds", "env_steps_per_second", "episodes"),
     *("success_rate", "zero_success_rate", "stage_rates", "return_mean", "penetration_max_mm"),
     *("num_envs", "workers", "config_digest", "finished"),
 ]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+import zstandard
 from browser import find_browser, open_page, until
 from commands import call, load_command
 from websockets.sync.client import connect
@@ -37,6 +38,9 @@ from dora.robot import load_robot
 COUNT = 12
 SMALL = 160
 """Width and height of the views of pictures that are tested [pixels]."""
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+"""First bytes of data compressed by zstd."""
 
 
 def free_port() -> int:
@@ -163,8 +167,16 @@ def websocket_text(url: str) -> str:
         text = ""
         while "(candidate 0)" not in text or "no contact" not in text:
             message = connection.recv(30)
-            text += message.decode(errors="ignore") if isinstance(message, bytes) else message
+            text += unpacked(message).decode(errors="ignore") if isinstance(message, bytes) else message
         return text
+
+
+def unpacked(message: bytes) -> bytes:
+    """A message with what is compressed in it: viser packs its text by zstd since version 1."""
+    start = message.find(ZSTD_MAGIC)
+    if start < 0:
+        return message
+    return message[:start] + unpacked(zstandard.ZstdDecompressor().decompressobj().decompress(message[start:]))
 
 
 def test_a_busy_port_is_refused(page: GraspPage):

@@ -16,7 +16,7 @@ FEWEST_WORDS = 4
 UNIT = r"(?:m|mm|cm|km|rad|deg|kg|g|s|ms|us|N|Hz|J|W|pixels|points|kg/m\^3)(?:\^\d)?"
 PHRASE = re.compile(rf"(?:1/)?{UNIT}(?:[ /*]{UNIT})*|per {UNIT}")
 PARENTHESIS = re.compile(r"(?<![\w\]`/])\(([^()]*)\)")
-DOCUMENTED = [path for path in MODULES if not {"tasks", "tools", "models"} & set(path.relative_to(ROOT).parts)]
+DOCUMENTED = [path for path in MODULES if not {"models"} & set(path.relative_to(ROOT).parts)]
 """Modules whose constants all have a string below them."""
 CONSTANT = re.compile(r"_?[A-Z][A-Z0-9_]*")
 

@@ -28,6 +28,7 @@ from dora.errors import InputError
 from dora.robot.shapes import Shape
 
 OBJECT_FILE = "object.toml"
+"""Name of the file of an object's folder that says what the object is."""
 FORMAT = "dora-object 1"
 """Format and version of an object's folder."""
 MOST_BYTES = 1_000_000

@@ -132,9 +132,10 @@ def make_result(
         "env": config.env,
         "agent": config.agent,
         "guidance": config.guidance,
-        "guidance_parts": config.task_options["guidance_parts"],
         "preset": config.preset,
         "seed": config.seed,
+        "commit": source_commit(),
+        "task_config": config.task,
         "env_steps": env_steps,
         "wall_seconds": round(wall_seconds, 3),
         "env_steps_per_second": round(rate, 1),
@@ -150,8 +151,7 @@ def make_result(
         "finished": finished,
         "eval_episodes": len(some.table) if some else 0,
         "penetration_p95_mm": some.penetration_p95_mm if some else None,
-        "commit": source_commit(),
-        "task_config": config.task,
+        "guidance_parts": config.task_options["guidance_parts"],
     }
 
 
