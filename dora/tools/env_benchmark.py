@@ -21,10 +21,13 @@ from dora.sim import BACKEND, StepProfile
 REFERENCE_PROCESSES = (2, 4, 8)
 """Process counts that the reference may choose from."""
 _ACTIONS_DRAWN = 64
+"""Random actions that are drawn once and used in turn [1]."""
 _WARM_UP_STEPS = 10
+"""Control steps before a measurement [1]."""
 _START_TIMEOUT = 300.0
 """Longest time to build all environments [s]."""
 _TASK: dict[str, Any] = {"obs_mode": "state", "render_backend": "none"}
+"""Options of every environment that is measured."""
 
 
 @dataclass(frozen=True)

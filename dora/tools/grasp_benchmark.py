@@ -45,9 +45,11 @@ SUBDIVISIONS = (0, 1, 2)
 PART_REPEATS = 200
 """How often a part is done for each candidate, in one measurement."""
 PART_ROWS = 32
+"""Candidates of such a measurement [1]."""
 REFERENCE_ROWS = 8
 """Candidates of the reference, which takes seconds per evaluation for more."""
 REFERENCE_REPEATS = 3
+"""Measurements of the reference [1]."""
 REPEATS = 10
 """Measurements of a short piece of work; the fastest counts, since other programs only slow it down."""
 

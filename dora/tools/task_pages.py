@@ -14,6 +14,7 @@ from dora.tasks.env.task import short_name
 from dora.tasks.mdp.randomisation import PRESETS
 
 BEGIN, END = "<!-- generated: begin -->", "<!-- generated: end -->"
+"""Marks on a page between which its generated part stands."""
 
 
 TITLES = {

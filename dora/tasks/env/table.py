@@ -12,10 +12,10 @@ TABLE_HEIGHT = 0.74
 """Height of the table top above the floor [m]."""
 LEG_HALF = 0.03
 """Half width of a table leg [m]."""
-WOOD = (0.55, 0.42, 0.30, 1.0)
-STEEL = (0.25, 0.26, 0.28, 1.0)
-FLOOR = (0.75, 0.76, 0.78, 1.0)
-WALL = (0.86, 0.88, 0.90, 1.0)
+WOOD, STEEL = (0.55, 0.42, 0.30, 1.0), (0.25, 0.26, 0.28, 1.0)
+"""Colours of the table top and the legs: red, green, blue and opacity [1]."""
+FLOOR, WALL = (0.75, 0.76, 0.78, 1.0), (0.86, 0.88, 0.90, 1.0)
+"""Colours of the room [1]."""
 ROOM_HALF = 3.0
 """Half width of the room that is only drawn [m]."""
 

@@ -24,8 +24,7 @@ from torch import Tensor
 
 from dora.sim.substeps import watch_physics
 
-HEAD_RADIUS = 0.008
-HEAD_HALF = 0.002
+HEAD_RADIUS, HEAD_HALF = 0.008, 0.002
 """Radius and half thickness of the nail's head as it is drawn [m]."""
 STOP_HALF = 0.010
 """Half thickness of the head for collisions [m]; a blow goes several millimetres into a thin one, and through."""

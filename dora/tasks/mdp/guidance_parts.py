@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from dora.errors import InputError
 
 GUIDANCE = ("affordance", "none")
+"""Values of the switch `guidance`."""
 OBSERVATION, REWARD, FILTER, PRIOR = PARTS = ("observation", "reward", "filter", "prior")
 """The parts of guidance: features in the observation, terms of the reward, choice among reachable candidates only,
-and the reference that the action corrects."""
+and the reference to which the action is a residual."""
 
 
 def guidance_in_force(guidance: str, parts: Sequence[str] | None) -> frozenset[str]:

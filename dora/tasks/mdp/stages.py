@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 S = TypeVar("S")
+"""What the functions of a stage look at: a snapshot, or what a reference tracks."""
 
 
 @dataclass(frozen=True)
