@@ -61,8 +61,12 @@ def _merged(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> d
             near = difflib.get_close_matches(str(name), values, 1)
             hint = f"did you mean {near[0]!r}?" if near else f"choose among {', '.join(values)}."
             raise InputError(f"{where} has no field {str(name)!r}: {hint}")
-        nested = isinstance(values[name], dict) and isinstance(value, Mapping)
-        merged[name] = _merged(values[name], value, f"{where}.{name}") if nested else _plain(value)
+        if isinstance(value, bool) and not isinstance(values[name], bool | None):
+            raise InputError(f"{where}.{name} must be a number or a text, not {value}.")
+        if isinstance(values[name], dict) and isinstance(value, Mapping):
+            merged[name] = _merged(values[name], value, f"{where}.{name}")
+        else:
+            merged[name] = _plain(value)
     return merged
 
 

@@ -185,7 +185,7 @@ def test_each_part_of_guidance_can_be_left_out(missing: str):
     assert gone == expected.get(missing, set())
     lost = set(whole.terms.terms) - set(task.terms.terms)
     assert lost == ({"affordance", "candidate"} if missing == "reward" else set())
-    assert task.arm.corrects == (missing != "prior")
+    assert task.arm.takes_residual == (missing != "prior")
     assert ("unreachable" in task.logged) == (missing != "filter")
     a, b = whole.reset(seed=3), task.reset(seed=3)
     torch.testing.assert_close(whole.snapshot.object.p, task.snapshot.object.p, atol=0, rtol=0)

@@ -30,7 +30,7 @@ def record_demonstrations(
 
     The files are those of ManiSkill's `RecordEpisode`: observations, actions, rewards and every state, so that its
     tools can replay and convert them. Without guidance (the default here) the actions are plain commands of the
-    wrist controller; with it they are corrections, all zero.
+    wrist controller; with it they are residuals, all zero.
 
     Args:
         env_id: a Dora id.

@@ -85,7 +85,7 @@ class Arm:
         return math.prod(self.agent.single_action_space.shape or ())
 
     @property
-    def corrects(self) -> bool:
+    def takes_residual(self) -> bool:
         """Whether actions are residuals of the reference: that part of guidance is in force, and actions command the
         wrist."""
         return PRIOR in self.guide.parts and self.agent.commands_wrist
@@ -136,7 +136,7 @@ class Arm:
             observed: the state as this arm observes it.
             action: its part of the action.
         """
-        if not self.corrects:
+        if not self.takes_residual:
             return action
         expand = self.agent.wrist_controller.expand_hand
         return self._encoded(self.guide.target(observed, action, expand))
@@ -144,7 +144,7 @@ class Arm:
     def scripted_action(self, observed: Snapshot) -> Float[Tensor, "n a"]:
         """Action that executes the chosen candidate from the present state: zero where actions are residuals, and
         elsewhere the reference's target as a plain action of the default controller."""
-        if self.corrects:
+        if self.takes_residual:
             return torch.zeros(len(observed.time), self.action_size, device=observed.time.device)
         target = self.guide.reference.target(observed)
         self.guide.reference.aim(target)

@@ -25,9 +25,10 @@ from dora.sim.batch.actions import check_array
 from dora.tasks.env.arm import Arm
 from dora.tasks.env.arm_group import ArmGroup
 from dora.tasks.env.description import describe
+from dora.tasks.env.episode_start import begin_episodes, drawn_sizes
 from dora.tasks.env.options import check_options, task_config
 from dora.tasks.env.perturbations import Perturbations
-from dora.tasks.env.scene import SCALE_DRAW, TaskScene, film_camera, sim_config
+from dora.tasks.env.scene import TaskScene, film_camera, sim_config
 from dora.tasks.env.state import resize, restore, saved_state
 from dora.tasks.env.task import Task
 from dora.tasks.guidance.guide import Guide
@@ -141,7 +142,8 @@ class DoraEnv(BaseEnv):
 
     def _load_scene(self, options: dict) -> None:
         task, names = self.task, tuple(dict.fromkeys(arm.object for arm in self.task.ARMS.values()))
-        scene = self.task_scene = TaskScene(self.scene, self.num_envs, self.config, self._draw_scale(len(names)))
+        scale = drawn_sizes(self, len(names)) if self._forced_scale is None else self._forced_scale
+        scene = self.task_scene = TaskScene(self.scene, self.num_envs, self.config, scale)
         for k, name in enumerate(names):
             scene.add(name, task.build(scene, name, self.scale[:, k].cpu().numpy()))
         self.mdp = task.make_mdp(scene)
@@ -157,14 +159,6 @@ class DoraEnv(BaseEnv):
         hands = {name: len(arm.agent.description.hand) for name, arm in self.arms.items()}
         size = self.num_envs, self.action_size
         self.perturbations = Perturbations(self.config.randomisation, *size, hands, self.config.dt, self.device)
-
-    def _draw_scale(self, objects: int) -> Float[Tensor, "n objects"]:
-        """Relative sizes, one draw from each environment's own stream."""
-        if self._forced_scale is not None:
-            return self._forced_scale
-        draws = np.asarray(self._batched_episode_rng.uniform(size=(SCALE_DRAW + objects - 1,)))
-        share = 2 * draws.reshape(self.num_envs, -1)[:, SCALE_DRAW - 1 :] - 1
-        return torch.tensor(1 + self.config.randomisation.size * share, dtype=torch.float32, device=self.device)
 
     def rebuild(self, scale: Float[Tensor, "n objects"]) -> None:
         """Builds the scene anew with objects of these relative sizes; begins new episodes."""
@@ -255,38 +249,7 @@ class DoraEnv(BaseEnv):
         return super().reset(seed=seeds, options=options)
 
     def _initialize_episode(self, env_idx: Tensor, options: dict) -> None:
-        place, mass, friction, error, key = self._draws(env_idx)
-        for arm in self.arms.values():
-            arm.agent.robot.set_qpos(arm.home_joints().expand(len(env_idx), -1))
-            arm.rest(env_idx)
-        self.task.place(self.task_scene, env_idx, place)
-        self.memory.begin(env_idx, {name: body.pose.p[env_idx] for name, body in self.objects.items()})
-        low, high = self.config.randomisation.friction
-        for k, name in enumerate(self.objects):
-            nominal = self.task_scene.nominal_masses(name)[env_idx]
-            self.memory.objects[name].write(
-                env_idx, mass=self.task.masses(name, nominal, mass[:, k]), friction=low + (high - low) * friction[:, k]
-            )
-        self.task_scene.apply_properties(self.memory, env_idx)
-        self.machine.reset(env_idx)
-        self.perturbations.begin(env_idx, key[:, 0])
-        errors = (2 * error - 1).split([choice.error_draws for choice in self.arms.choices.values()], -1)
-        for arm, e in zip(self.arms.values(), errors, strict=True):
-            pose = self.objects[arm.spec.object].pose
-            p, q = pose.p[env_idx], pose.q[env_idx]
-            arm.choose(env_idx, p, q, self.task.reachable(arm, p, q), e, self.config.randomisation, self.narrow)
-
-    def _draws(self, env_idx: Tensor) -> tuple[Tensor, ...]:
-        """Uniform numbers of new episodes (b, ...): place, masses, friction, candidates' errors, key of the noise.
-
-        One draw per environment from its own stream: neither num_envs nor the others' resets change it.
-        """
-        errors = sum(choice.error_draws for choice in self.arms.choices.values())
-        parts = [self.task.DRAWS, len(self.objects), len(self.objects), errors, 1]
-        assert sum(parts) < SCALE_DRAW
-        draws = np.asarray(self._batched_episode_rng[env_idx.cpu().numpy()].uniform(size=(sum(parts),)))
-        u = torch.as_tensor(draws, dtype=torch.float32, device=self.device).reshape(len(env_idx), sum(parts))
-        return u.split(parts, -1)
+        begin_episodes(self, env_idx)
 
     # -------------------------------------------------------------------- step
 

@@ -32,9 +32,6 @@ from dora.tasks.mdp.memory import EpisodeMemory, HandSizes
 from dora.tasks.mdp.snapshot import Snapshot
 from dora.tasks.mdp.stages import StageMachine
 
-SCALE_DRAW = 256
-"""Which number of an environment's stream is its size [1]: episodes begin with the same numbers, and use fewer."""
-
 
 class TaskScene:
     """What a task's scene consists of, in all environments; made anew at a reconfiguration.

@@ -91,7 +91,6 @@ class Nail:
         self._driven = np.zeros(n, np.float32)
         self._since = np.full(n, settings.blow_window, np.float32)
         self._speed = np.zeros(n, np.float32)
-        self._impact = np.zeros(n, np.float32)
         self._hammers: list[sapien.physx.PhysxRigidDynamicComponent] = []
         self._faces: Float[np.ndarray, "n 3"] = np.zeros((n, 3))
         self._scene = scene
@@ -111,7 +110,7 @@ class Nail:
         self.articulation.set_qpos(torch.zeros(len(rows), 1, device=self._device))
         self.articulation.set_qvel(torch.zeros(len(rows), 1, device=self._device))
         index = rows.cpu().numpy()
-        for buffer in (self._depth, self._driven, self._speed, self._impact):
+        for buffer in (self._depth, self._driven, self._speed):
             buffer[index] = 0.0
         self._since[index] = self.settings.blow_window
         self._hold(index.tolist())
@@ -135,7 +134,6 @@ class Nail:
         if depth > before + MOVED:
             if self._speed[i] > self.settings.blow_speed:
                 self._since[i] = 0.0
-                self._impact[i] = self._speed[i]
             if self._since[i] < self.settings.blow_window:
                 self._driven[i] += depth - before
             self._depth[i] = depth
@@ -164,20 +162,15 @@ class Nail:
         """How far each nail has been driven by blows [m]."""
         return torch.tensor(self._driven, device=self._device)
 
-    @property
-    def impact(self) -> Float[Tensor, " n"]:
-        """Speed of the last blow [m/s]; 0 before the first."""
-        return torch.tensor(self._impact, device=self._device)
-
     def get_state(self) -> dict[str, Tensor]:
         """What the simulator does not keep, each (n,)."""
-        names = ("_depth", "_driven", "_since", "_speed", "_impact")
+        names = ("_depth", "_driven", "_since", "_speed")
         return {f"nail{name}": torch.tensor(getattr(self, name), device=self._device) for name in names}
 
     def set_state(self, state: dict[str, Tensor], rows: Tensor) -> None:
         """Inverse of `get_state` for the environments `rows` (b,)."""
         index = rows.cpu().numpy()
-        for name in ("_depth", "_driven", "_since", "_speed", "_impact"):
+        for name in ("_depth", "_driven", "_since", "_speed"):
             getattr(self, name)[index] = state[f"nail{name}"].reshape(-1).cpu().numpy()
         self._hold(index.tolist())
 

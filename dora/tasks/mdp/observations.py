@@ -30,8 +30,8 @@ class Entry:
         unit: unit of the values, "1" if dimensionless.
         doc: what it is, for the documentation table.
         guided: True if it exists only with guidance.
-        prior: True if it is about the reference that the action corrects, and exists only with that part of guidance;
-            all other guided entries belong to the part "observation".
+        prior: True if it is about the reference to which the action is a residual; it exists only with that part of
+            guidance, all other guided entries belong to the part "observation".
     """
 
     value: Callable[[Any], Tensor]
@@ -55,17 +55,17 @@ def observation_table(arms: Sequence[str], extra: Mapping[str, Entry], parts: fr
     """
     table = {**ARM_ENTRIES, **extra}
     if len(arms) > 1:
-        own = {name: entry for name, entry in table.items() if name not in SHARED_ENTRIES}
-        seen = {
-            f"{arm}/{name}": replace(entry, value=_as_seen_by(arm, entry))
+        own = {
+            f"{arm}/{name}": replace(entry, value=_as_observed_by(arm, entry))
             for arm in arms
-            for name, entry in own.items()
+            for name, entry in table.items()
+            if name not in SHARED_ENTRIES
         }
-        table = {**seen, **{name: ARM_ENTRIES[name] for name in SHARED_ENTRIES}}
+        table = {**own, **{name: ARM_ENTRIES[name] for name in SHARED_ENTRIES}}
     return {name: entry for name, entry in table.items() if entry.exists(parts)}
 
 
-def _as_seen_by(arm: str, entry: Entry) -> Callable[[Any], Tensor]:
+def _as_observed_by(arm: str, entry: Entry) -> Callable[[Any], Tensor]:
     return lambda s: entry.value(s.of(arm))
 
 

@@ -1,4 +1,4 @@
-"""How much an episode is randomised and disturbed: named presets, the same for every task."""
+"""How much an episode is randomised and perturbed: named presets, the same for every task."""
 
 from dataclasses import dataclass
 

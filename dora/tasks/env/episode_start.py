@@ -1,0 +1,56 @@
+"""The beginning of episodes: all random numbers are drawn here, and everything gets its first state from them."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+SCALE_DRAW = 256
+"""Which number of an environment's stream is its size [1]: episodes begin with the same numbers, and use fewer."""
+
+
+def drawn_sizes(env: Any, objects: int) -> Float[Tensor, "n objects"]:
+    """Sizes of a new scene's objects relative to their nominal ones, one draw from each environment's own stream."""
+    draws = np.asarray(env._batched_episode_rng.uniform(size=(SCALE_DRAW + objects - 1,)))
+    share = 2 * draws.reshape(env.num_envs, -1)[:, SCALE_DRAW - 1 :] - 1
+    return torch.tensor(1 + env.config.randomisation.size * share, dtype=torch.float32, device=env.device)
+
+
+def begin_episodes(env: Any, rows: Int[Tensor, " b"]) -> None:
+    """Starts new episodes in the environments `rows`: robots, objects, memory, stages, noise, candidates."""
+    place, mass, friction, error, key = _draws(env, rows)
+    for arm in env.arms.values():
+        arm.agent.robot.set_qpos(arm.home_joints().expand(len(rows), -1))
+        arm.rest(rows)
+    env.task.place(env.task_scene, rows, place)
+    env.memory.begin(rows, {name: body.pose.p[rows] for name, body in env.objects.items()})
+    randomisation = env.config.randomisation
+    low, high = randomisation.friction
+    for k, name in enumerate(env.objects):
+        nominal = env.task_scene.nominal_masses(name)[rows]
+        env.memory.objects[name].write(
+            rows, mass=env.task.masses(name, nominal, mass[:, k]), friction=low + (high - low) * friction[:, k]
+        )
+    env.task_scene.apply_properties(env.memory, rows)
+    env.machine.reset(rows)
+    env.perturbations.begin(rows, key[:, 0])
+    errors = (2 * error - 1).split([choice.error_draws for choice in env.arms.choices.values()], -1)
+    for arm, e in zip(env.arms.values(), errors, strict=True):
+        pose = env.objects[arm.spec.object].pose
+        p, q = pose.p[rows], pose.q[rows]
+        arm.choose(rows, p, q, env.task.reachable(arm, p, q), e, randomisation, env.narrow)
+
+
+def _draws(env: Any, rows: Tensor) -> tuple[Tensor, ...]:
+    """Uniform numbers of new episodes (b, ...): place, masses, friction, candidates' errors, key of the noise.
+
+    One draw per environment from its own stream: neither num_envs nor the others' resets change it.
+    """
+    errors = sum(choice.error_draws for choice in env.arms.choices.values())
+    parts = [env.task.DRAWS, len(env.objects), len(env.objects), errors, 1]
+    assert sum(parts) < SCALE_DRAW
+    draws = np.asarray(env._batched_episode_rng[rows.cpu().numpy()].uniform(size=(sum(parts),)))
+    u = torch.as_tensor(draws, dtype=torch.float32, device=env.device).reshape(len(rows), sum(parts))
+    return u.split(parts, -1)

@@ -1,0 +1,141 @@
+"""Numbers of tasks as configuration: overridden by name, checked, shown, and in force."""
+
+from dataclasses import dataclass, field
+
+import gymnasium as gym
+import pytest
+import torch
+
+import dora
+from dora.configs import built, overridden, plain
+from dora.errors import InputError
+from dora.tasks import find_task, make_task, task_ids
+from dora.tasks.cube import CubeConfig
+from dora.tasks.env.options import task_config
+from dora.tasks.hammer.task import HammerConfig
+from dora.tasks.mdp.randomisation import PRESETS, Randomisation
+from dora.tools import describe
+
+assert dora
+
+
+@dataclass(frozen=True)
+class Inner:
+    """A nested configuration."""
+
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Outer:
+    """A configuration of all types of fields."""
+
+    length: float = 0.1
+    count: int = 2
+    name: str = "a"
+    both: tuple[float, float] = (0.0, 1.0)
+    limit: float | None = None
+    inner: Inner = field(default_factory=Inner)
+
+
+def test_fields_are_overridden_by_name_and_the_others_stay():
+    changed = overridden(Outer(), {"length": 2, "inner": {"weight": 3}, "both": [1, 2], "limit": 0.5}, "config")
+    assert changed == Outer(length=2.0, both=(1.0, 2.0), limit=0.5, inner=Inner(3.0))
+    assert isinstance(changed.length, float)
+    assert overridden(Outer(), Outer(count=5), "config") == Outer(count=5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"lenght": 1.0}, "config has no field 'lenght': did you mean 'length'?"),
+        ({"qqq": 1.0}, "choose among length, count"),
+        ({"inner": {"wait": 1.0}}, "config.inner has no field 'wait'"),
+        ({"length": "far"}, "length must be float, not 'far'"),
+        ({"count": 1.5}, "count must be int, not 1.5"),
+        ({"count": True}, "count"),
+        ({"both": [1.0]}, "both"),
+        ({"inner": 3}, "inner"),
+        ([("length", 1.0)], "mapping"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_sentence(changes: object, words: str):
+    with pytest.raises(InputError) as error:
+        overridden(Outer(), changes, "config")
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_plain_data_make_the_same_configuration_again():
+    for config in (Outer(), CubeConfig(), HammerConfig()):
+        assert built(type(config), plain(config)) == config
+        assert overridden(type(config)(), plain(config), "config") == config
+    with pytest.raises(InputError, match="settings"):
+        built(Outer, plain(Outer()) | {"count": "two"})
+
+
+@pytest.mark.parametrize("env_id", task_ids())
+def test_the_preset_is_the_randomisation_that_can_be_overridden(env_id: str):
+    cls = find_task(env_id).CONFIG
+    for name, randomisation in PRESETS.items():
+        assert task_config(cls, name, None).randomisation == randomisation
+    changed = task_config(cls, "hard", {"randomisation": {"push": 0.5}}).randomisation
+    assert (changed.push, changed.delay) == (0.5, PRESETS["hard"].delay)
+    assert changed == Randomisation(**(plain(PRESETS["hard"]) | {"push": 0.5, "friction": PRESETS["hard"].friction}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"control_frequency": 0}, "at least 1"),
+        ({"physics_frequency": 110}, "multiple of config.control_frequency, 20 Hz"),
+        ({"lift": None}, "lift must be float"),
+    ],
+)
+def test_numbers_that_cannot_be_built_are_refused(changes: dict, words: str):
+    with pytest.raises(InputError, match=words):
+        gym.make("DoraCube-v1", config=changes)
+
+
+def test_thresholds_weights_and_rates_are_in_force():
+    numbers = {"lift": 0.02, "control_frequency": 10, "weights": {"lift": 6.0}, "residual": {"position": 0.0}}
+    task = make_task("DoraCube-v1", 2, preset="none", config=numbers)
+    usual = make_task("DoraCube-v1", 2, preset="none")
+    for env in (task, usual):
+        env.reset(seed=0)
+    assert (task.control_freq, usual.control_freq) == (10, 20)
+    s = task.snapshot
+    shares = [float(env.terms.terms["lift"].weight) for env in (task, usual)]
+    assert shares == [6.0, 3.0]
+    push = torch.ones(2, task.action_size)
+    start = s.hand.wrist_p.clone()
+    for _ in range(3):
+        task.step(push * torch.tensor([1.0] * 3 + [0.0] * (task.action_size - 3)))
+    beside = make_task("DoraCube-v1", 2, preset="none", config=numbers)
+    beside.reset(seed=0)
+    for _ in range(3):
+        beside.step(0 * push)
+    # residuals of no size move nothing
+    torch.testing.assert_close(task.snapshot.hand.wrist_p, beside.snapshot.hand.wrist_p, atol=1e-6, rtol=0)
+    assert (task.snapshot.hand.wrist_p - start).norm(dim=-1).min() > 0.01
+    for env in (task, usual, beside):
+        env.close()
+
+
+def test_printing_an_environment_shows_the_tables_in_force(capsys: pytest.CaptureFixture[str]):
+    assert describe.main(["DoraJug-v1", "--preset", "hard", "--task.lift", "0.12", "--task.weights.lift", "2.5"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for words in ("lift task 2.5 rise", "reach 0.05 never", "weights.lift 2.5", "lift 0.12", "randomisation.push 0.05"):
+        assert words in shown, words
+    task = make_task("DoraJug-v1", 1, guidance="none")
+    text = str(task)
+    assert "guided" not in text
+    assert "hand_q" in text
+    assert text in str(gym.Wrapper(task))
+    task.close()
+
+
+@pytest.mark.parametrize(("words", "message"), [([], "Say which task"), (["DoraJog-v1"], "did you mean DoraJug-v1")])
+def test_describing_nothing_is_refused(words: list[str], message: str, capsys: pytest.CaptureFixture[str]):
+    assert describe.main(words) == 2
+    assert message in capsys.readouterr().err
