@@ -101,12 +101,13 @@ class DoraEnv(BaseEnv):
             guidance, guidance_parts, hand_joints, task_config(self.TASK.CONFIG, preset, config), robot_uids,
             len(self.TASK.ARMS), num_envs, control_mode, sim_backend, render_backend, render_mode, obs_mode,
         )  # fmt: skip
+        if grasps is not None and len(self.TASK.ARMS) > 1:
+            raise InputError(f"grasps are of one arm, and there are {', '.join(self.TASK.ARMS)}: leave them out")
         self.parts, self.config, self._grasps = options.parts, options.config, grasps
-        self.task = self.TASK(self.config)
+        self.task, several = self.TASK(self.config), len(options.robots) > 1
         self._shares: dict[str, float] = {}
         self._tables: dict[str, ReachTable] = {}
         self._forced_scale: Tensor | None = None
-        several = len(options.robots) > 1
         super().__init__(
             *args,
             num_envs=num_envs,
