@@ -20,14 +20,14 @@ OBJECT_SHAPES: dict[str, tuple[int, ...]] = {
     "p": (3,), "q": (4,), "v": (3,), "w": (3,), "half": (3,), "start_p": (3,), "supported": (),
 }  # fmt: skip
 GOAL_SHAPES: dict[str, tuple[int, ...]] = {
-    "p": (3,), "q": (4,), "approach": (3,), "pregrasp": (HAND,), "grasp": (HAND,), "near_p": (NEAR, 3),
-    "near_q": (NEAR, 4), "phase": (4,), "residual": (ACTION,),
+    "p": (3,), "q": (4,), "approach": (3,), "pregrasp": (HAND,), "grasp": (HAND,), "nearest_p": (NEAR, 3),
+    "nearest_q": (NEAR, 4), "phase": (4,), "residual": (ACTION,),
 }  # fmt: skip
 SHARED_SHAPES: dict[str, tuple[int, ...]] = {
     "penetration": (), "max_penetration": (), "stage": (), "time": (),
     "action": (ACTION,), "previous_action": (ACTION,),
 }  # fmt: skip
-QUATERNIONS = ("q", "wrist_q", "tip_q", "near_q")
+QUATERNIONS = ("q", "wrist_q", "tip_q", "nearest_q")
 """Fields that are unit quaternions, where their last axis has four components."""
 KINDS = {"touch": torch.bool, "supported": torch.bool, "stage": torch.long, "contact_finger": torch.long}
 """Fields that are no floats."""
@@ -49,7 +49,7 @@ def invented(n: int, **given: Tensor) -> Snapshot:
     """A snapshot of one arm and one object: zeros, unit quaternions, boxes of half extents 3 cm, with what is given.
 
     Fields of the hand are named as in `HandState`, or `hand_q`, `hand_v`; those of the object `object_p`, ...,
-    `start_p`, `supported`; those of the goal `goal_p`, ..., `near_p`, `near_q`, `phase`, `residual`.
+    `start_p`, `supported`; those of the goal `goal_p`, ..., `nearest_p`, `nearest_q`, `phase`, `residual`.
     """
     hand: dict[str, Any] = {"tip_radius": TIP_RADIUS}
     body: dict[str, Any] = {"half": torch.full((n, 3), 0.03)}

@@ -179,7 +179,7 @@ def test_each_part_of_guidance_can_be_left_out(missing: str):
     task = tasks.make_task("DoraCube-v1", 2, guidance_parts=tuple(p for p in PARTS if p != missing))
     gone = set(whole.observation_entries) - set(task.observation_entries)
     expected = {
-        "observation": {"goal", "goal_hand", "near", "surface"},
+        "observation": {"goal", "goal_hand", "nearest", "surface"},
         "prior": {"phase", "residual"},
     }
     assert gone == expected.get(missing, set())

@@ -19,7 +19,7 @@ from dora.geometry.rotations import (
 )
 from dora.sim.substeps import watch_physics
 from dora.tasks.hammer import mdp
-from dora.tasks.hammer.ballistics import Strike, arrival, fall_time, fallen, slid
+from dora.tasks.hammer.ballistics import Strike, after_fall, arrival, fall_time, slid
 from dora.tasks.hammer.reference import ALIGN, CatchReference
 from dora.tasks.hammer.snapshot import HAND_CENTRE, HammerSnapshot, face_to_nail, handle_distance, misalignment
 from dora.tasks.hammer.task import UNKNOWN, HammerConfig, HammerTask
@@ -69,7 +69,7 @@ def test_the_predicted_point_is_at_the_height_at_the_time_of_arrival():
     velocity, spin = 0.5 * torch.randn(n, 3), 0.5 * torch.randn(n, 3)
     point, height = 0.1 * torch.randn(n, 3), torch.full((n,), 0.3)
     time = arrival(body, velocity, spin, point, height)
-    position, quaternion = fallen(body, velocity, spin, time)
+    position, quaternion = after_fall(body, velocity, spin, time)
     z = (position + quaternion_apply(quaternion, point))[:, 2]
     torch.testing.assert_close(z, height, atol=2e-3, rtol=0)
 

@@ -56,25 +56,25 @@ def test_an_interrupted_hold_starts_again():
     for height in (0.2, 0.2, 0.0, 0.2, 0.2):
         m.advance(state([0.01], [height]))
     assert m.index.item() == 1
-    assert m.held.item() == 2
+    assert m.hold_count.item() == 2
 
 
 def test_partial_reset_touches_only_its_rows():
     m = StageMachine(STAGES, 5, DT)
-    m.index[:], m.held[:], m.furthest[:] = 1, 2, 1
+    m.index[:], m.hold_count[:], m.furthest[:] = 1, 2, 1
     m.reset(torch.tensor([1, 3]))
     assert m.index.tolist() == [1, 0, 1, 0, 1]
-    assert m.held.tolist() == [2, 0, 2, 0, 2]
+    assert m.hold_count.tolist() == [2, 0, 2, 0, 2]
     assert m.index.shape == (5,)
 
 
 def test_state_round_trip_by_rows():
     m, other = StageMachine(STAGES, 3, DT), StageMachine(STAGES, 3, DT)
-    m.index[:], m.held[:], m.furthest[:] = torch.tensor([0, 1, 2]), 2, 2
+    m.index[:], m.hold_count[:], m.furthest[:] = torch.tensor([0, 1, 2]), 2, 2
     rows = torch.tensor([2, 1])
     other.set_state({k: v[rows] for k, v in m.get_state().items()}, rows)
     assert other.index.tolist() == [0, 1, 2]
-    assert other.held.tolist() == [0, 2, 2]
+    assert other.hold_count.tolist() == [0, 2, 2]
 
 
 def test_batch_equals_singles():

@@ -114,10 +114,15 @@ class Perturbations:
             position = body.p + r.observed_position * error[:, :3]
             tilt = quaternion_from_rotation_vector(r.observed_rotation * error[:, 3:6])
             quaternion = quaternion_multiply(body.q, tilt)
-            near_p, near_q, approach = choices[arm].goals(position, quaternion)
+            nearest_p, nearest_q, approach = choices[arm].goals(position, quaternion)
             objects[name] = replace(body, p=position, q=quaternion)
             hands[arm] = replace(s.hands[arm], q=s.hands[arm].q + r.observed_joint * error[:, OBJECT_DRAWS:])
             goals[arm] = replace(
-                s.goals[arm], p=near_p[:, 0], q=near_q[:, 0], approach=approach, near_p=near_p, near_q=near_q
+                s.goals[arm],
+                p=nearest_p[:, 0],
+                q=nearest_q[:, 0],
+                approach=approach,
+                nearest_p=nearest_p,
+                nearest_q=nearest_q,
             )
         return observed(s, hands, objects, goals)

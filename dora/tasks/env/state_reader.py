@@ -158,10 +158,10 @@ class StateReader:
 
 def _goal(guide: Guide, body: ObjectState) -> GoalState:
     """What the candidates of one arm ask for at the object's pose."""
-    near_p, near_q, approach = guide.choice.goals(body.p, body.q)
+    nearest_p, nearest_q, approach = guide.choice.goals(body.p, body.q)
     chosen = guide.choice.buffers
     return GoalState(
-        p=near_p[:, 0], q=near_q[:, 0], approach=approach, near_p=near_p, near_q=near_q,
+        p=nearest_p[:, 0], q=nearest_q[:, 0], approach=approach, nearest_p=nearest_p, nearest_q=nearest_q,
         pregrasp=chosen.pregrasp.clone(), grasp=chosen.grasp.clone(),
         phase=guide.reference.one_hot(), residual=guide.residual.buffers.residual.clone(),
     )  # fmt: skip

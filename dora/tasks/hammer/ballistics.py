@@ -41,7 +41,9 @@ def fall_time(height: Float[Tensor, " n"], speed: Float[Tensor, " n"]) -> Float[
     return torch.where(square > 0, time, 0.0).clamp(0, LATEST)
 
 
-def fallen(body: Pose, velocity: Float[Tensor, "n 3"], spin: Float[Tensor, "n 3"], time: Float[Tensor, " n"]) -> Pose:
+def after_fall(
+    body: Pose, velocity: Float[Tensor, "n 3"], spin: Float[Tensor, "n 3"], time: Float[Tensor, " n"]
+) -> Pose:
     """Pose of a free body after a time [s]: p + v t - g t^2 / 2 and exp(w t) q, with constant spin [rad/s]."""
     t = time[:, None]
     drop = torch.zeros_like(velocity)
@@ -67,7 +69,7 @@ def arrival(
     """
     time = torch.zeros_like(height)
     for _ in range(ROUNDS):
-        lever = quaternion_apply(fallen(body, velocity, spin, time)[1], carried)[:, 2]
+        lever = quaternion_apply(after_fall(body, velocity, spin, time)[1], carried)[:, 2]
         time = fall_time(body[0][:, 2] + lever - height, velocity[:, 2])
     return time
 

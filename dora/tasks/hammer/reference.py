@@ -23,7 +23,7 @@ from dora.geometry.rotations import (
 )
 from dora.tasks.guidance.reference import Reference
 from dora.tasks.guidance.residual_action import Target
-from dora.tasks.hammer.ballistics import Strike, arrival, fallen, slid
+from dora.tasks.hammer.ballistics import Strike, after_fall, arrival, slid
 from dora.tasks.hammer.reach import REACH, TURN
 from dora.tasks.hammer.snapshot import HammerSnapshot
 from dora.tasks.mdp.stages import Stage
@@ -151,19 +151,19 @@ class CatchReference(Reference):
         self.settings = settings or CatchSettings()
         super().__init__(
             phases(self.settings), num_envs, dt, device,
-            home_p=(3,), home_q=(4,), lead_p=(3,), lead_q=(4,), held_p=(3,), held_q=(4,),
+            home_p=(3,), home_q=(4,), lead_p=(3,), lead_q=(4,), grasped_p=(3,), grasped_q=(4,),
             spent=(), sinking=(), depth=(),
         )  # fmt: skip
         self.strike, self._driven = strike, driven
         self._reach = torch.tensor([*REACH, 0.0], device=device)
-        for name in ("home_q", "lead_q", "held_q"):
+        for name in ("home_q", "lead_q", "grasped_q"):
             getattr(self.buffers, name)[:, 0] = 1.0
 
     def begin(self, rows: Int[Tensor, " b"], wrist_p: Float[Tensor, "b 3"], wrist_q: Float[Tensor, "b 4"]) -> None:
         """Starts with the wrist where it is: it will wait at this height."""
         self.buffers.write(
             rows, home_p=wrist_p, home_q=wrist_q, lead_p=wrist_p, lead_q=wrist_q,
-            held_p=0.0, spent=0.0, sinking=0.0, depth=0.0,
+            grasped_p=0.0, spent=0.0, sinking=0.0, depth=0.0,
         )  # fmt: skip
         self.phase.reset(rows)
 
@@ -179,7 +179,9 @@ class CatchReference(Reference):
         The candidate is moved along the handle: a tilted handle that falls straight down shifts sideways.
         """
         b = self.buffers
-        soon = fallen((s.object.p, s.object.q), s.object.v, s.object.w, self._arrival(s).clamp(max=self.settings.ahead))
+        soon = after_fall(
+            (s.object.p, s.object.q), s.object.v, s.object.w, self._arrival(s).clamp(max=self.settings.ahead)
+        )
         goal = compose(soon, relative((s.object.p, s.object.q), (s.goal.p, s.goal.q)))
         axis = quaternion_apply(soon[1], torch.tensor([0.0, 0.0, 1.0], device=height.device).expand_as(s.object.p))
         position, quaternion = slid(goal, axis, height)
@@ -238,9 +240,9 @@ class CatchReference(Reference):
         b.depth.copy_(torch.where(phase == SWING, b.depth, s.nail_depth))
         share = torch.where(phase <= CLOSE, 1.0, torch.where(phase == SWING, 0.0, self.settings.memory))
         seen = relative((s.hand.wrist_p, s.hand.wrist_q), (s.object.p, s.object.q))
-        held_p, held_q = blend((b.held_p, b.held_q), seen, share)
-        b.held_p.copy_(held_p)
-        b.held_q.copy_(held_q)
+        grasped_p, grasped_q = blend((b.grasped_p, b.grasped_q), seen, share)
+        b.grasped_p.copy_(grasped_p)
+        b.grasped_q.copy_(grasped_q)
 
     def _sinking(self, s: HammerSnapshot, lead: Pose) -> Pose:
         """The lead, sinking with the hammer for a moment, so that the fingers have time to close around it."""
@@ -264,4 +266,4 @@ class CatchReference(Reference):
     def _wrist(self, raised: Tensor, gap: Tensor | float) -> Pose:
         """Wrist pose that brings the held hammer there."""
         b = self.buffers
-        return compose(self.strike.hammer(b.depth, raised, gap), inverse((b.held_p, b.held_q)))
+        return compose(self.strike.hammer(b.depth, raised, gap), inverse((b.grasped_p, b.grasped_q)))

@@ -14,7 +14,7 @@ from dora.geometry.rotations import (
     quaternion_multiply,
 )
 from dora.tasks.mdp.guidance_parts import OBSERVATION, PRIOR
-from dora.tasks.mdp.quantities import goal_error, in_wrist, lifted, near_errors, turned_in_wrist
+from dora.tasks.mdp.quantities import goal_error, in_wrist, lifted, nearest_errors, turned_in_wrist
 from dora.tasks.mdp.snapshot import Snapshot
 
 FASTEST_SPIN = 30.0
@@ -118,8 +118,8 @@ ARM_ENTRIES: dict[str, Entry] = {
         lambda s: torch.cat(goal_error(s), -1), "m, rad", "wrist to candidate: position and rotation vector", True
     ),
     "goal_hand": Entry(lambda s: s.goal.grasp - s.hand.q, "rad", "candidate's closed hand minus measured joints", True),
-    "near": Entry(
-        lambda s: near_errors(s)[:, 1:].flatten(1),
+    "nearest": Entry(
+        lambda s: nearest_errors(s)[:, 1:].flatten(1),
         "m, rad",
         "wrist to the next nearest candidates: position and rotation vector of each",
         True,

@@ -38,11 +38,11 @@ def goal_error(s: Snapshot) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]
 
 
 @derived
-def near_errors(s: Snapshot) -> Float[Tensor, "n k 6"]:
+def nearest_errors(s: Snapshot) -> Float[Tensor, "n k 6"]:
     """Position [m] and rotation vector [rad] from the wrist to each of the near candidates, in the hand-base frame."""
-    back = quaternion_inverse(s.hand.wrist_q)[:, None].expand_as(s.goal.near_q)
-    shift = quaternion_apply(back, s.goal.near_p - s.hand.wrist_p[:, None])
-    return torch.cat([shift, rotation_vector_from_quaternion(quaternion_multiply(back, s.goal.near_q))], -1)
+    back = quaternion_inverse(s.hand.wrist_q)[:, None].expand_as(s.goal.nearest_q)
+    shift = quaternion_apply(back, s.goal.nearest_p - s.hand.wrist_p[:, None])
+    return torch.cat([shift, rotation_vector_from_quaternion(quaternion_multiply(back, s.goal.nearest_q))], -1)
 
 
 @derived

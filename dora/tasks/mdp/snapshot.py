@@ -85,7 +85,7 @@ class GoalState:
         p, q: wrist pose that the chosen candidate asks for, world frame.
         approach: unit direction of the wrist's last motion towards it, world frame.
         pregrasp, grasp: hand joints of that candidate [rad].
-        near_p, near_q: the same wrist poses for the nearest reachable candidates, the chosen one first.
+        nearest_p, nearest_q: the same wrist poses for the nearest reachable candidates, the chosen one first.
         phase: the reference's phase, one-hot.
         residual: low-passed residual action, in units of its bounds.
     """
@@ -95,8 +95,8 @@ class GoalState:
     approach: Float[Tensor, "n 3"]
     pregrasp: Float[Tensor, "n hand"]
     grasp: Float[Tensor, "n hand"]
-    near_p: Float[Tensor, "n k 3"]
-    near_q: Float[Tensor, "n k 4"]
+    nearest_p: Float[Tensor, "n k 3"]
+    nearest_q: Float[Tensor, "n k 4"]
     phase: Float[Tensor, "n phases"]
     residual: Float[Tensor, "n a"]
 

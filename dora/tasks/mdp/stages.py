@@ -48,7 +48,7 @@ class StageMachine(Generic[S]):
                 raise ValueError(f"stage {s.name!r} goes back to {s.back_to!r}, which is not an earlier stage")
         self.stages = tuple(stages)
         self.index = torch.zeros(num_envs, dtype=torch.int64, device=device)
-        self.held = torch.zeros_like(self.index)
+        self.hold_count = torch.zeros_like(self.index)
         self.furthest = torch.zeros_like(self.index)
         # Row K stands for "finished": never left, never held.
         self._hold = torch.tensor([max(1, round(s.hold / dt)) for s in stages] + [1], device=device)
@@ -59,7 +59,7 @@ class StageMachine(Generic[S]):
 
     def reset(self, env_idx: Tensor) -> None:
         """Sends the environments in `env_idx` (b,) back to the first stage; the others keep theirs."""
-        for buffer in (self.index, self.held, self.furthest):
+        for buffer in (self.index, self.hold_count, self.furthest):
             buffer[env_idx] = 0
 
     def advance(self, s: S) -> None:
@@ -69,11 +69,11 @@ class StageMachine(Generic[S]):
         lost = torch.stack([x.lost(s) if x.lost else no for x in self.stages] + [no])
         now = self.index[None]
         is_done, is_lost = done.gather(0, now)[0], lost.gather(0, now)[0]
-        held = torch.where(is_done, self.held + 1, 0)
+        held = torch.where(is_done, self.hold_count + 1, 0)
         forward = held >= self._hold[self.index]
         forward &= self.index < len(self)
         step = torch.where(is_lost, self._back[self.index], self.index + forward)
-        self.held.copy_(torch.where(forward | is_lost, 0, held))
+        self.hold_count.copy_(torch.where(forward | is_lost, 0, held))
         self.index.copy_(step)
         self.furthest.copy_(torch.maximum(self.furthest, step))
 
@@ -85,11 +85,11 @@ class StageMachine(Generic[S]):
 
     def get_state(self) -> dict[str, Tensor]:
         """The machine's (N,) buffers by name."""
-        return {"stage": self.index.clone(), "held": self.held.clone(), "furthest": self.furthest.clone()}
+        return {"stage": self.index.clone(), "hold_count": self.hold_count.clone(), "furthest": self.furthest.clone()}
 
     def set_state(self, state: dict[str, Tensor], env_idx: Tensor | slice) -> None:
         """Inverse of `get_state` for the rows `env_idx`; values may be floats, as in flattened states."""
-        for name, buffer in (("stage", self.index), ("held", self.held), ("furthest", self.furthest)):
+        for name, buffer in (("stage", self.index), ("hold_count", self.hold_count), ("furthest", self.furthest)):
             buffer[env_idx] = state[name].reshape(-1).to(buffer.dtype)
 
     @property
