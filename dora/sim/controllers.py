@@ -25,6 +25,10 @@ WRIST_SPIN = 2.0
 """Angular wrist speed of a full action about one axis [rad/s], unless a task sets its own."""
 ARM_LEASH = 0.3
 """Largest lead of a commanded arm joint over the measured one [rad]; stops wind-up in contact."""
+ORIGIN = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+"""The world's own pose: position [m], quaternion wxyz."""
+AT_ORIGIN = 1e-6
+"""Largest difference of a base's pose from the world's that is rounding of the simulator [m], [1]."""
 LIMIT_MARGIN = 0.01
 """Distance that commanded arm joints keep from their limits [rad]."""
 
@@ -59,6 +63,7 @@ class WristHandController(BaseController):
         self._begun = False
         self._starting: Tensor | None = None
         self._known: tuple[Tensor, Frames] | None = None
+        self._origin: Tensor = torch.empty(0)
 
     def _initialize_action_space(self) -> None:
         size = 6 + self.hand_size
@@ -135,8 +140,8 @@ class WristHandController(BaseController):
         The base pose is read at each call (0.01 ms of a control step of 1 ms and more), so that a base that a task
         has just moved counts at once.
         """
-        base = self.articulation.pose
-        return compose((base.p, base.q), self.wrist())
+        base = self._moved_base()
+        return self.wrist() if base is None else compose(base, self.wrist())
 
     def to_base_frame(self, step: Float[Tensor, "n 6"]) -> Float[Tensor, "n 6"]:
         """A displacement in the world frame, turned into the base frame of the action.
@@ -147,8 +152,19 @@ class WristHandController(BaseController):
         Args:
             step: translation of the wrist [m], then rotation vector [rad], both in the world frame.
         """
-        back = quaternion_inverse(self.articulation.pose.q)
+        base = self._moved_base()
+        if base is None:
+            return step
+        back = quaternion_inverse(base[1])
         return torch.cat([quaternion_apply(back, step[:, :3]), quaternion_apply(back, step[:, 3:])], -1)
+
+    def _moved_base(self) -> Pose | None:
+        """Pose of the robot's base in the world; None where it is the world's frame in every environment."""
+        pose = self.articulation.pose.raw_pose
+        if self._origin.shape != pose.shape:
+            self._origin = pose.new_tensor(ORIGIN).expand_as(pose)
+        at_origin = torch.allclose(pose, self._origin, rtol=0.0, atol=AT_ORIGIN)
+        return None if at_origin else (pose[:, :3], pose[:, 3:])
 
     def _frames(self) -> Frames:
         """Forward kinematics of the commanded arm, once per command."""

@@ -147,6 +147,8 @@ class Snapshot:
 
     def of(self: "S", arm: str) -> "S":
         """The same state as one arm sees it: its hand, the object that it handles, its goal; made once."""
+        if len(self.hands) == len(self.objects) == 1:
+            return self
         views = self.__dict__.setdefault("_views", {})
         if arm not in views:
             name = self.handles[arm]
