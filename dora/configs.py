@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import math
 from collections.abc import Mapping
 from typing import Any, TypeVar, get_type_hints
 
@@ -92,3 +93,35 @@ def built(cls: type[C], values: Mapping[str, Any]) -> C:
     except dacite.DaciteError as error:
         raise InputError(f"settings: {_sentence(error)}.") from error
     return cls(**{name: getattr(checked, name) for name in known})
+
+
+def check_finite(config: Any, what: str) -> None:
+    """Refuses a configuration that holds NaN or infinity.
+
+    Args:
+        config: a configuration, or a value of one.
+        what: how messages call it.
+
+    Raises:
+        InputError: naming the first such number.
+    """
+    if dataclasses.is_dataclass(config):
+        for f in dataclasses.fields(config):
+            check_finite(getattr(config, f.name), f"{what}.{f.name}")
+    elif isinstance(config, tuple | list):
+        for value in config:
+            check_finite(value, what)
+    elif isinstance(config, float) and not math.isfinite(config):
+        raise InputError(f"{what} is {config}; it has to be a finite number.")
+
+
+def check_not_negative(config: Any, what: str) -> None:
+    """Refuses negative numbers among the fields of a configuration; tuples and nested configurations may have them.
+
+    Raises:
+        InputError: naming the first such field.
+    """
+    for f in dataclasses.fields(config):
+        value = getattr(config, f.name)
+        if isinstance(value, int | float) and value < 0:
+            raise InputError(f"{what}.{f.name} is {value}; it cannot be negative.")

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import dora
+from dora.agents.runs.recommended import recommended
 from dora.configs import built, overridden, plain
 from dora.errors import InputError
 from dora.tasks import find_task, make_task, task_ids
@@ -64,6 +65,37 @@ def test_what_does_not_fit_is_refused_in_one_sentence(changes: object, words: st
         overridden(Outer(), changes, "config")
     assert words in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"lift": -1.0}, "config.lift is -1.0; it cannot be negative"),
+        ({"lift": float("nan")}, "config.lift is nan; it has to be a finite number"),
+        ({"centre": (0.5, float("inf"))}, "config.centre is inf"),
+        ({"weights": {"lift": float("nan")}}, "config.weights.lift is nan"),
+        ({"residual": {"joint": -0.1}}, "config.residual.joint is -0.1"),
+        ({"randomisation": {"push": -1.0}}, "config.randomisation.push is -1.0"),
+        ({"randomisation": {"mass": 1.0}}, "config.randomisation.mass is 1.0; it is a share"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(changes: dict, words: str):
+    with pytest.raises(InputError) as error:
+        task_config(CubeConfig, "standard", changes)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("agent", "name", "value"),
+    [
+        ("ppo", "gamma", 2.0), ("sac", "gamma", float("nan")), ("ppo", "minibatch", 0), ("sac", "n_step", 0),
+        ("sac", "polyak", -0.1), ("ppo", "learning_rate", 0.0), ("ppo", "noise_correlation", 1.0),
+        ("sac", "hidden", (256, 0)), ("ppo", "target_kl", float("inf")),
+    ],
+)  # fmt: skip
+def test_settings_of_a_learner_that_make_no_sense_are_refused(agent: str, name: str, value: object):
+    with pytest.raises(InputError, match=name.replace("_", ".")):
+        recommended("DoraCube-v1", agent, learner={name: value})
 
 
 def test_plain_data_make_the_same_configuration_again():

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from mani_skill.agents.registration import REGISTERED_AGENTS
 
-from dora.configs import overridden
+from dora.configs import check_finite, check_not_negative, overridden
 from dora.errors import InputError
 from dora.robot import available_robots
 from dora.sim.batch.rendering import can_render
@@ -34,10 +34,19 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Mapping[str, Any] |
     """The numbers of a task: its own, the preset's randomisation, then `changes`.
 
     Raises:
-        InputError: for an unknown preset, an unknown name, a value of the wrong type, or rates that do not fit.
+        InputError: for an unknown preset, an unknown name, a value of the wrong type, a number that is not finite or
+            negative where it is a size, time, speed or count, or rates that do not fit.
     """
     base: TaskConfig = replace(cls(), randomisation=find_preset(preset))
     config = overridden(base, changes or {}, "config")
+    check_finite(config, "config")
+    check_not_negative(config, "config")
+    check_not_negative(config.residual, "config.residual")
+    check_not_negative(config.randomisation, "config.randomisation")
+    for name in ("size", "mass"):
+        if getattr(config.randomisation, name) >= 1:
+            width = getattr(config.randomisation, name)
+            raise InputError(f"config.randomisation.{name} is {width}; it is a share and has to be below 1.")
     for name in ("control_frequency", "physics_frequency", "solver_iterations"):
         if getattr(config, name) < 1:
             raise InputError(f"config.{name} is {getattr(config, name)}; it has to be at least 1.")
