@@ -27,13 +27,13 @@ def pack(maps: UInt8[Tensor, "c p"]) -> dict[str, Tensor]:
     }
 
 
-def unpack(tensors: dict[str, Tensor], rows: int, points: int, whose: str) -> UInt8[Tensor, "c p"]:
+def unpack(tensors: dict[str, Tensor], rows: int, points: object, whose: str) -> UInt8[Tensor, "c p"]:
     """The maps that `pack` packed, which are taken out of `tensors`.
 
     Args:
         tensors: of the file.
         rows: number c of maps.
-        points: number p of points of each.
+        points: number p of points of each, as the file says.
         whose: they are, for the message.
 
     Raises:
