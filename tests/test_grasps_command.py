@@ -19,6 +19,7 @@ from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.search.cache import hand_of, map_of
 from dora.affordance.search.optimise import Settings
+from dora.affordance.views import album
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.sim.grasp_tests import generation as grasps
@@ -261,6 +262,7 @@ def test_labelled_meshes_by_others_go_all_the_way(
     """Import, regions, search by region, simulation, files, and pictures of them, in a short search."""
     monkeypatch.setenv("DORA_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(grasps, "Settings", lambda: QUICK)
+    monkeypatch.setattr(album, "FINER", 1.0)
     options, shape = FOREIGN[name]
     labels, out = tmp_path / "labels.yaml", tmp_path / "found.safetensors"
     labels.write_text(json.dumps({"regions": {"grip": shape}}))

@@ -15,7 +15,7 @@ from dora.affordance.objects.palette import PALETTE, colours
 from dora.affordance.search.cache import map_of
 from dora.affordance.views.pictures import PARTS
 
-EDGE, SHARE = 0.004, 1 / 40
+EDGE, SHARE = 0.004, 1 / 30
 """Longest edge of the triangles that carry colours, in metres [m] and in largest extents of the object [1]."""
 MOST_CUTS = 12
 """Largest number of times that a triangle is subdivided."""
