@@ -50,10 +50,7 @@ def helpers() -> list[BaseProcess]:
 
 
 def test_processes_give_the_rows_of_one_process():
-    alone, shared = (
-        Evaluators(functools.partial(PointMass, CONFIG.eval_envs), dataclasses.replace(CONFIG, workers=workers))
-        for workers in (1, 2)
-    )
+    alone, shared = (Evaluators(PointMass, dataclasses.replace(CONFIG, workers=workers)) for workers in (1, 2))
     torch.manual_seed(0)
     policy = make_learner(CONFIG, *alone.sizes).policy
     for acting in (policy, None):
@@ -78,7 +75,7 @@ def test_processes_give_the_rows_of_one_process():
     ],
 )
 def test_a_failing_helper_is_reported_and_ended(failure: str, error: type[Exception], message: str):
-    make = functools.partial(FailsElsewhere, CONFIG.eval_envs, os.getpid(), failure)
+    make = functools.partial(FailsElsewhere, home=os.getpid(), failure=failure)
     evaluators = Evaluators(make, CONFIG)
     with pytest.raises(error, match=message):
         evaluators.run(None, EPISODES, 0)
@@ -90,7 +87,7 @@ def test_an_interrupt_ends_the_helpers():
     def interrupted() -> None:
         raise KeyboardInterrupt
 
-    evaluators = Evaluators(functools.partial(PointMass, CONFIG.eval_envs), CONFIG)
+    evaluators = Evaluators(PointMass, CONFIG)
     with pytest.raises(KeyboardInterrupt):
         evaluators.run(None, EPISODES, 0, interrupted)
     assert not helpers()
@@ -98,7 +95,7 @@ def test_an_interrupt_ends_the_helpers():
 
 
 def test_a_helper_that_is_gone_is_reported():
-    evaluators = Evaluators(functools.partial(PointMass, CONFIG.eval_envs), CONFIG)
+    evaluators = Evaluators(PointMass, CONFIG)
     evaluators.run(None, EPISODES, 0)
     [helper] = helpers()
     helper.kill()
