@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import pi
+from typing import Any
 
 import numpy as np
 import pytest
@@ -286,7 +287,8 @@ def beside_nail(task: tasks.DoraEnv, shift: tuple[float, float, float], turn: fl
     body = over_nail(task, 0.01, 1.6)
     p, q = torch.tensor(body.entity_pose.p), torch.tensor(body.entity_pose.q)
     tilt = quaternion_from_rotation_vector(torch.tensor([[0.0, turn, 0.0]]))
-    task.target_object.set_pose(Pose.create_from_pq((p + torch.tensor(shift))[None], quaternion_multiply(tilt, q[None])))
+    p = p + torch.tensor(shift)
+    task.target_object.set_pose(Pose.create_from_pq(p[None], quaternion_multiply(tilt, q[None])))
     task.target_object.set_linear_velocity(torch.tensor([[0.0, 0.0, -1.6]]))
 
 
@@ -319,7 +321,8 @@ def test_a_blow_with_something_else_is_no_blow(bench: tasks.DoraEnv):
     builder.add_box_collision(half_size=(0.03, 0.03, 0.03), density=0.6 / 0.06**3)
     builder.initial_pose = sapien.Pose([*CONFIG.nail.top[:2], CONFIG.nail.top[2] + 0.04])
     block = builder.build("block")
-    block.find_component_by_type(sapien.physx.PhysxRigidDynamicComponent).set_linear_velocity([0.0, 0.0, -1.6])
+    body: Any = block.find_component_by_type(sapien.physx.PhysxRigidDynamicComponent)
+    body.set_linear_velocity([0.0, 0.0, -1.6])
     depth, driven = run(bench, 6)
     block.remove_from_scene()
     assert depth > 2

@@ -119,7 +119,7 @@ def test_guided_terms_can_be_taken_away():
     terms: Terms[State] = Terms(
         {"a": Term(lambda s: s.height, 1.0, "affordance", True), "b": Term(lambda s: s.height, 1.0)}
     )
-    assert list(terms.without_guidance().terms) == ["b"]
+    assert list(terms.in_force(frozenset()).terms) == ["b"]
 
 
 def test_tolerance_hits_its_anchors_on_both_sides():

@@ -57,7 +57,7 @@ def test_a_start_without_any_candidate_is_no_try():
 
 def test_among_equals_the_one_reached_more_often_is_first():
     two = load_candidates("cube").select([0, 1])
-    best_first = ranked(two, TaskRanking(torch.tensor([3, 9]), torch.tensor([1.0, 1.0])))
+    best_first = ranked(two, TaskRanking(torch.tensor([3, 9]), torch.tensor([1.0, 1.0]), 0))
     torch.testing.assert_close(best_first.position, two.position[[1, 0]])
 
 

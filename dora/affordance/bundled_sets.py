@@ -11,12 +11,17 @@ from dora.robot import RobotDescription, load_robot
 
 ROBOT = "diana7_hit"
 """Robot for which candidates are bundled."""
-GRASPS_FILE = "grasps.safetensors"
-"""Name of the file of candidates in an object's folder."""
+GRASPS_FILE, ANY_REGION_FILE = "grasps.safetensors", "grasps-any-region.safetensors"
+"""Names of the files of candidates in an object's folder: of a search for the target region, and of one that knows no
+region."""
 
 
-def bundled_path(name: str | Path) -> Path:
+def bundled_path(name: str | Path, region: bool = True) -> Path:
     """Where the bundled candidates of an object are, or would be.
+
+    Args:
+        name: of an object or its folder, as for `load_object`.
+        region: those of the search for the target region, or of the one that knows no region.
 
     Raises:
         InputError: there is no such object, or it is a mesh without a folder.
@@ -27,36 +32,42 @@ def bundled_path(name: str | Path) -> Path:
             f"the object {obj.name!r} has no folder for its grasps: "
             f"write one with python -m dora.affordance.objects.build {obj.name} --mesh {name}."
         )
-    return obj.folder / GRASPS_FILE
+    return obj.folder / (GRASPS_FILE if region else ANY_REGION_FILE)
 
 
-def best_candidates(name: str | Path, grasp_class: str, least: float, most: int) -> GraspCandidates:
-    """The bundled candidates of one class that succeeded often enough, best first.
+def best_candidates(
+    name: str | Path, grasp_class: str, least: float, most: int, region: bool = True
+) -> GraspCandidates:
+    """The bundled candidates that succeeded often enough, best first; of one class, if the search knew the region.
 
     Args:
         name: of an object or its folder, as for `load_object`.
         grasp_class: such as "HandleGrasp".
         least: smallest score (share of executions that succeeded); candidates without one are left out.
         most: largest number of candidates.
+        region: as for `bundled_path`; without it candidates of all classes are taken.
     """
-    found = load_candidates(name)
-    return found.select(found.of_class(grasp_class) & (found.score >= least)).select(slice(most))
+    found = load_candidates(name, region=region)
+    wanted = found.score >= least
+    return found.select(wanted & found.of_class(grasp_class) if region else wanted).select(slice(most))
 
 
-def load_candidates(name: str | Path, robot: RobotDescription | None = None) -> GraspCandidates:
+def load_candidates(name: str | Path, robot: RobotDescription | None = None, region: bool = True) -> GraspCandidates:
     """The validated and ranked candidates in an object's folder, best first.
 
     Args:
         name: of an object or its folder, as for `load_object`.
         robot: that has to fit (default diana7_hit).
+        region: as for `bundled_path`.
 
     Raises:
         InputError: unknown object, no candidates, or candidates that do not fit the object or the robot.
     """
-    path = bundled_path(name)
+    path = bundled_path(name, region)
     if not path.is_file():
+        option = "" if region else " --any-region"
         raise InputError(
             f"the object {str(name)!r} has no grasps ({path}): "
-            f"make them with python experiments/grasps.py --object {name} --make-bundle."
+            f"make them with python experiments/grasps.py --object {name} --make-bundle{option}."
         )
     return GraspCandidates.load(path, load_object(name), robot or load_robot(ROBOT))

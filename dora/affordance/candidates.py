@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -110,6 +111,15 @@ class GraspCandidates:
                 raise InputError(f"candidates of {self.object!r}: {name} holds a value that is not finite")
         if bool((self.contact_map > HAND_PARTS).any()):
             raise InputError(f"candidates of {self.object!r}: contact_map holds a class that is not 0 to {HAND_PARTS}")
+
+    @property
+    def ranking_steps(self) -> int | None:
+        """Control steps that were simulated to rank the set, as its settings say; None if they do not."""
+        try:
+            made = json.loads(self.settings or "{}")
+        except ValueError:
+            return None
+        return made.get("ranking_steps") if isinstance(made, dict) else None
 
     def __len__(self) -> int:
         return len(self.grasp_class)

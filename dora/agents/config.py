@@ -116,8 +116,8 @@ class RunConfig(Generic[Numbers, Settings, Agent]):
     """Task id, for example DoraCube-v1."""
     agent: Agent
     """Learner."""
-    guidance: Literal["affordance", "none"] = "affordance"
-    """Use affordance maps and grasp candidates, or nothing of them."""
+    guidance: Literal["affordance", "grasps", "none"] = "affordance"
+    """Use affordance maps and grasp candidates, candidates of a search that knows no region, or neither."""
     guidance_parts: tuple[Literal["observation", "reward", "filter", "prior"], ...] | None = None
     """Parts of guidance in force, for ablations; None: all of them."""
     preset: Literal["none", "standard", "hard"] = "standard"
@@ -159,7 +159,7 @@ class RunConfig(Generic[Numbers, Settings, Agent]):
     @property
     def has_prior(self) -> bool:
         """Whether actions are residuals of a reference, so that zero actions are a policy worth measuring."""
-        return self.guidance == "affordance" and (self.guidance_parts is None or "prior" in self.guidance_parts)
+        return self.guidance != "none" and (self.guidance_parts is None or "prior" in self.guidance_parts)
 
     @property
     def task_options(self) -> dict[str, Any]:

@@ -69,6 +69,8 @@ class Args:
     make_bundle: bool = False
     """Make the bundled set of --object instead, grasps.safetensors in its folder: enough valid grasps, ranked by
     simulated lifts or holds; then what --rank-in-task does, where a task uses the object."""
+    any_region: bool = False
+    """With --make-bundle or --rank-in-task: the set of a search that knows no region, which guidance "grasps" uses."""
     rank_in_task: bool = False
     """Execute the bundled set of --object in the task that uses it, and rank it by the episodes that succeed."""
     contact_maps: bool = False
@@ -139,9 +141,9 @@ def remake(args: Args) -> None:
     ids = tasks_of(load_object(name))
     with ProgressDisplay() as phases:
         if args.make_bundle:
-            print(make_bundle(name, args.seed, phases, usable_in_task(name)))
+            print(make_bundle(name, args.seed, phases, usable_in_task(name), not args.any_region))
         if args.rank_in_task or ids:
-            print(rank_bundled_set(name, lambda title: phases.phase(title, "episodes")))
+            print(rank_bundled_set(name, lambda title: phases.phase(title, "episodes"), not args.any_region))
 
 
 def main() -> int:

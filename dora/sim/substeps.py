@@ -1,6 +1,7 @@
 """Callbacks after every physics step, also on the batched back end, which makes many steps per call of `step`."""
 
 from collections.abc import Callable
+from typing import Any
 
 from mani_skill.envs.scene import ManiSkillScene
 
@@ -38,4 +39,5 @@ def watch_contacts(scene: ManiSkillScene, watch: Callable[[int, list], None]) ->
     if isinstance(scene, BatchScene):
         scene.px.stepper.contact_watchers.append(watch)
     else:
-        watch_physics(scene, lambda environment: watch(environment, scene.px.get_contacts()))
+        system: Any = scene.px
+        watch_physics(scene, lambda environment: watch(environment, system.get_contacts()))

@@ -52,7 +52,7 @@ def make_task(env_id: str, num_envs: int, guidance: str = "affordance", **option
     Args:
         env_id: a Dora id.
         num_envs: environments in the batch.
-        guidance: "affordance" or "none".
+        guidance: "affordance", "grasps" or "none".
         options: further arguments of the task.
 
     Raises:

@@ -14,6 +14,7 @@ from mani_skill.utils.structs import Actor, Pose
 from sapien.physx import PhysxMaterial
 from torch import Tensor
 
+from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import load_object
@@ -40,6 +41,7 @@ from dora.tasks.mdp.terms import (
     paper_lift,
     paper_penalty,
     penalties,
+    while_active,
 )
 
 
@@ -123,8 +125,8 @@ class CubeTask(Task):
         c: CubeConfig = self.config
         return Mdp(stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS)
 
-    def candidates(self, arm: str) -> GraspCandidates:
-        return hand_made_candidates()
+    def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
+        return hand_made_candidates() if region else load_candidates("cube", region=False)
 
     def start_grid(self, arm: str) -> Grid:
         return Grid(self.config.centre, (self.config.spread,) * 2)
@@ -148,17 +150,21 @@ class CubeTask(Task):
 
     def place(self, scene: TaskScene, rows: Tensor, u: Tensor) -> None:
         """The cube stands on a face, somewhere in the area, at any yaw."""
-        reachable = partial(self.reachable, scene.arms["arm"])
+        reachable = partial(self.startable, scene.arms["arm"])
         scene.object.set_pose(Pose.create_from_pq(*standing(u, scene.half[rows, 2], self.start_grid("arm"), reachable)))
 
 
 OBSERVATIONS: dict[str, Entry] = {
     "half": Entry(lambda s: s.object.half[:, :1], "m", "half edge of the cube"),
-    "surface": Entry(lambda s: surface_distance(s), "m", "distance of each fingertip's surface from the cube's", True),
+    "surface": Entry(
+        lambda s: surface_distance(s), "m", "distance of each fingertip's surface from the cube's", True, region=True
+    ),
 }
 """What the task observes beyond the common entries."""
 
 
+REACH, GRASP, LIFT = range(3)
+"""Indices of the stages."""
 RED = (0.85, 0.25, 0.15, 1.0)
 """Colour of the cube, red, green, blue and opacity [1]."""
 
@@ -225,15 +231,21 @@ def terms(c: CubeConfig) -> Terms[Snapshot]:
         {
             "affordance": Term(
                 lambda s: near_region(surface_distance(s)), w.affordance, "affordance", True,
-                "exp(-alpha * sum of fingertip distances)",
+                "exp(-alpha * sum of fingertip distances)", region=True,
             ),
             "candidate": Term(
                 lambda s: at_candidate(s, off_table(s)), w.candidate, "task", True,
                 "closeness of the wrist to the candidate",
             ),
-            "reach": Term(near, w.reach, doc="thumb and one finger near the cube"),
-            "grasp": Term(finger_contacts, w.grasp, doc="contacts: thumb against a finger, and how many fingers"),
-            "lift": Term(lift, w.lift, doc="rise, saturating at the target height"),
+            "reach": Term(while_active(REACH, near), w.reach, doc="thumb and one finger near the cube; 1 afterwards"),
+            "grasp": Term(
+                while_active(GRASP, finger_contacts), w.grasp,
+                doc="contacts: thumb against a finger, and how many fingers; 1 afterwards",
+            ),
+            "lift": Term(
+                lambda s: torch.where(s.stage >= LIFT, lift(s), 0.0), w.lift,
+                doc="rise, saturating at the target height, once it is grasped",
+            ),
             "held": Term(clean, w.held, doc="lifted, opposed, off the table, and no overlap above the limit so far"),
             **penalties(w, c.free_overlap, c.penetration_limit),
         }

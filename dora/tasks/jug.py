@@ -44,8 +44,11 @@ from dora.tasks.mdp.terms import (
     paper_lift,
     paper_penalty,
     penalties,
+    while_active,
 )
 
+REACH, GRASP, LIFT = range(3)
+"""Indices of the stages."""
 CLASS = "HandleGrasp"
 """The grasp class that the task asks for."""
 
@@ -67,7 +70,7 @@ class JugWeights(PenaltyWeights):
     lift: float = 3.0
     """Rise [1]."""
     held: float = 1.5
-    """Lifted and held upright without overlap [1]."""
+    """Lifted by the handle and held upright without overlap [1]."""
     tilt: float = -1.0
     """Tilt [1]."""
 
@@ -149,8 +152,8 @@ class JugTask(Task):
         c: JugConfig = self.config
         return Mdp(stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS, partial(failed, c=c))
 
-    def candidates(self, arm: str) -> GraspCandidates:
-        return best_candidates("jug", CLASS, self.config.fewest_lifts, self.config.most_candidates)
+    def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
+        return best_candidates("jug", CLASS, self.config.fewest_lifts, self.config.most_candidates, region)
 
     def make_reference(self, scene: TaskScene, arm: str) -> Reference:
         return GraspReference(scene.num_envs, self.config.dt, scene.device, self.config.reference)
@@ -169,16 +172,20 @@ class JugTask(Task):
     def place(self, scene: TaskScene, rows: Tensor, u: Tensor) -> None:
         """The jug stands upright, somewhere in the area, at any yaw."""
         height = jug().support * scene.scale[rows, 0]
-        reachable = partial(self.reachable, scene.arms["arm"])
+        reachable = partial(self.startable, scene.arms["arm"])
         scene.object.set_pose(Pose.create_from_pq(*standing(u, height, self.start_grid("arm"), reachable)))
 
 
 OBSERVATIONS: dict[str, Entry] = {
     "scale": Entry(lambda s: size(s)[:, None], "1", "size of the jug relative to the nominal one"),
     "surface": Entry(lambda s: region_distances(s).amin(-1), "m", "distance of each fingertip from the jug"),
-    "handle": Entry(lambda s: handle_distance(s), "m", "distance of each fingertip from the handle", True),
-    "handle_p": Entry(lambda s: in_wrist(s, handle_p(s)), "m", "centre of the handle in the hand frame", True),
-    "class": Entry(lambda s: _label_one_hot(s), "1", "region that the contacts vote for: body, handle, rim", True),
+    "handle": Entry(lambda s: handle_distance(s), "m", "distance of each fingertip from the handle", True, region=True),
+    "handle_p": Entry(
+        lambda s: in_wrist(s, handle_p(s)), "m", "centre of the handle in the hand frame", True, region=True
+    ),
+    "class": Entry(
+        lambda s: _label_one_hot(s), "1", "region that the contacts vote for: body, handle, rim", True, region=True
+    ),
 }
 """What the task observes beyond the common entries."""
 
@@ -214,12 +221,13 @@ def terms(c: JugConfig) -> Terms[Snapshot]:
         return tolerance(_to_jug(s), margin=0.25)
 
     def lift(s: Snapshot) -> Tensor:
-        """Rise, less of it the more the jug tilts: half of it at the largest tilt that counts."""
+        """Rise by the handle, less of it the more the jug tilts: half of it at the largest tilt that counts."""
         level = 1 - 0.5 * (1 - uprightness(s)) / (1 - cos(c.upright))
-        return rise(s, c.lift) * (0.3 + 0.7 * opposed(s).float()) * level.clamp(0, 1)
+        grasped = opposed(s) & by_the_handle(s)
+        return rise(s, c.lift) * (0.3 + 0.7 * grasped.float()) * level.clamp(0, 1) * (s.stage >= LIFT)
 
     def clean(s: Snapshot) -> Tensor:
-        return (held(s, c) & (s.max_penetration <= c.penetration_limit)).float()
+        return (held(s, c) & by_the_handle(s) & (s.max_penetration <= c.penetration_limit)).float()
 
     def tilt(s: Snapshot) -> Tensor:
         return (uprightness(s).clamp(-1, 1).acos() / c.upright).clamp(0, 1)
@@ -228,19 +236,24 @@ def terms(c: JugConfig) -> Terms[Snapshot]:
         {
             "affordance": Term(
                 lambda s: near_region(handle_distance(s)), w.affordance, "affordance", True,
-                "exp(-alpha * sum of fingertip distances to handle)",
+                "exp(-alpha * sum of fingertip distances to handle)", region=True,
             ),
             "candidate": Term(
                 lambda s: at_candidate(s, off_table(s)), w.candidate, "task", True,
                 "closeness of the wrist to the candidate",
             ),
-            "class": Term(
-                lambda s: by_the_handle(s).float(), w.grasp_class, "task", True, "the contacts vote for HandleGrasp"
+            "class": Term(lambda s: by_the_handle(s).float(), w.grasp_class, doc="the contacts vote for HandleGrasp"),
+            "reach": Term(while_active(REACH, near), w.reach, doc="thumb and one finger near the jug; 1 afterwards"),
+            "grasp": Term(
+                while_active(GRASP, finger_contacts), w.grasp,
+                doc="contacts: thumb against a finger, and how many fingers; 1 afterwards",
             ),
-            "reach": Term(near, w.reach, doc="thumb and one finger near the jug"),
-            "grasp": Term(finger_contacts, w.grasp, doc="contacts: thumb against a finger, and how many fingers"),
-            "lift": Term(lift, w.lift, doc="rise, saturating at the target height, less if tilted"),
-            "held": Term(clean, w.held, doc="lifted, upright, opposed, off the table, never too much overlap"),
+            "lift": Term(
+                lift, w.lift, doc="rise once it is grasped, saturating, less if tilted or not held by the handle"
+            ),
+            "held": Term(
+                clean, w.held, doc="lifted, upright, opposed, by the handle, off the table, never too much overlap"
+            ),
             "tilt": Term(tilt, w.tilt, "penalty", doc="tilt, as a share of the largest that counts as lifted"),
             **penalties(w, c.free_overlap, c.penetration_limit),
         }

@@ -31,7 +31,7 @@ class Args(Generic[Numbers]):
     """Task id, for example DoraJug-v1."""
     preset: Literal["none", "standard", "hard"] = "standard"
     """How much episodes are randomised and perturbed."""
-    guidance: Literal["affordance", "none"] = "affordance"
+    guidance: Literal["affordance", "grasps", "none"] = "affordance"
     """Use affordance maps and grasp candidates, or nothing of them."""
     task: Numbers
     """Numbers of the task."""

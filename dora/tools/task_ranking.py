@@ -4,6 +4,8 @@ An arm cannot reach every grasp that a simulated hand without an arm holds (`dor
 grasps that it reaches penetrate the object too deep when it is lifted. Episodes of the task show which ones succeed.
 """
 
+import itertools
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -49,10 +51,12 @@ class TaskRanking:
     Attributes:
         tries: episodes in which each one was executed; few or none where the arm seldom reaches it.
         score: share of them that succeeded; 0 without an episode.
+        steps: control steps that were simulated, over all candidates.
     """
 
     tries: Int[Tensor, " c"]
     score: Float[Tensor, " c"]
+    steps: int
 
 
 class _Balanced:
@@ -78,16 +82,18 @@ class _Balanced:
 
 
 class _Executor:
-    """Executes batches of episodes of a task with candidates, one batch after the other."""
+    """Executes batches of episodes of a task with candidates, one batch after the other; `region` as in
+    `rank_in_task`."""
 
-    def __init__(self, env_id: str, preset: str, candidates: GraspCandidates):
+    def __init__(self, env_id: str, preset: str, candidates: GraspCandidates, region: bool):
         self.task, self.count = make_task(env_id, BATCH, preset=preset, grasps=candidates), len(candidates)
+        self.region = region
 
     def __call__(self, case: tuple[int, int]) -> tuple[Int[Tensor, " c"], Int[Tensor, " c"]]:
         """How often each candidate was executed, and how often with success, in a batch of (index, seed)."""
         index, seed = case
         self.task.narrow = pick = _Balanced(self.count, index * BATCH)
-        won = _executed(self.task, seed).cpu() & pick.possible
+        won = _executed(self.task, seed, self.region).cpu() & pick.possible
         return pick.tries, torch.bincount(pick.led[won], minlength=self.count)
 
 
@@ -99,6 +105,7 @@ def rank_in_task(
     progress: Callable[[int, int], None] | None = None,
     seed: int = SEED,
     processes: int | None = None,
+    region: bool = True,
 ) -> TaskRanking:
     """Execute c candidates in a task, each about equally often, where f_reach allows it.
 
@@ -110,6 +117,7 @@ def rank_in_task(
         progress: is called with (episodes done, episodes).
         seed: of starts and errors; the result does not depend on `processes`.
         processes: number of processes, one per core by default; 1 stays in this process.
+        region: count the task's success; otherwise whether the object is held in the end, whatever region of it.
     """
     cases = [(index, seed + index) for index in range(-(-episodes // BATCH))]
 
@@ -117,20 +125,22 @@ def rank_in_task(
         if progress is not None:
             progress(done * BATCH, total * BATCH)
 
-    found = run_cases(_Executor, (env_id, preset, candidates), cases, processes, report, chunk=1)
+    found = run_cases(_Executor, (env_id, preset, candidates, region), cases, processes, report, chunk=1)
     tries, wins = (torch.stack(counts).sum(0) for counts in zip(*found, strict=True))
-    return TaskRanking(tries, wins / tries.clamp(min=1))
+    return TaskRanking(tries, wins / tries.clamp(min=1), len(cases) * BATCH * find_task(env_id).MAX_STEPS)
 
 
-def _executed(task: DoraEnv, seed: int) -> Bool[Tensor, " n"]:
-    """Which of n episodes of the scripted solution succeed, without failure on the way and within `CLEAN`."""
+def _executed(task: DoraEnv, seed: int, region: bool) -> Bool[Tensor, " n"]:
+    """Which of n episodes of the scripted solution succeed, or hold the object in the end whatever its region, without
+    failure on the way and within `CLEAN`."""
     task.reset(seed=seed)
     failed = torch.zeros(task.num_envs, dtype=torch.bool, device=task.device)
     info: dict[str, Tensor] = {}
     for _ in range(task.max_steps):
         *_, info = task.step(task.scripted_action())
         failed |= info["fail"]
-    return info["success"] & ~failed & (task.memory.max_penetration <= CLEAN * task.config.penetration_limit)
+    won = info["success"] if region else task.task.held(task.snapshot)
+    return won & ~failed & (task.memory.max_penetration <= CLEAN * task.config.penetration_limit)
 
 
 def ranked(candidates: GraspCandidates, ranking: TaskRanking) -> GraspCandidates:
@@ -169,8 +179,9 @@ class _Usable:
         return (task.task.reachable(task.arm, pose.p, pose.q).float().mean(0) >= USABLE).cpu()
 
 
-def rank_bundled_set(name: str | Path, phase: Callable[[str], Callable[[int, int], None]]) -> Path:
-    """Executes the bundled grasps of an object's target class in its task and stores them anew, best first.
+def rank_bundled_set(name: str | Path, phase: Callable[[str], Callable[[int, int], None]], region: bool = True) -> Path:
+    """Executes the bundled grasps of an object in its task and stores them anew, best first, with the number of steps
+    that this took. Those of the search for the target region are ranked if they have its class.
 
     All are tried a few times, and the better ones again with other starts: their scores are those of the second round,
     and those of the others at most as high. Grasps of other classes follow as they were. The tables of f_reach in the
@@ -179,6 +190,8 @@ def rank_bundled_set(name: str | Path, phase: Callable[[str], Callable[[int, int
     Args:
         name: of an object or its folder, as for `load_object`.
         phase: gives the progress callback of a named phase.
+        region: the set of the search for the target region, ranked by success; otherwise the set of the search that
+            knows no region, of all classes, ranked by whether the object is held.
 
     Raises:
         InputError: no such object, no candidates, or no task that uses the object.
@@ -187,19 +200,21 @@ def rank_bundled_set(name: str | Path, phase: Callable[[str], Callable[[int, int
     ids = tasks_of(obj)
     if not ids:
         raise InputError(f"no task uses the object {str(name)!r}, so its grasps cannot be ranked in one.")
-    found = load_candidates(name)
-    wanted = found.of_class(obj.target_class)
+    found = load_candidates(name, region=region)
+    wanted = found.of_class(obj.target_class) if region else torch.ones(len(found), dtype=torch.bool)
     tested = found.select(wanted)
     count, everything, better = len(tested), phase(f"{obj.name}: execute all"), f"{obj.name}: execute the better ones"
-    tested = ranked(tested, rank_in_task(ids[0], tested, FIRST_TRIES * count, progress=everything))
+    first = rank_in_task(ids[0], tested, FIRST_TRIES * count, progress=everything, region=region)
+    tested = ranked(tested, first)
     few = math.ceil(BETTER * count)
     best, rest = tested.select(slice(few)), tested.select(slice(few, None))
-    again = rank_in_task(ids[0], best, MORE_TRIES * few, progress=phase(better), seed=2 * SEED)
+    again = rank_in_task(ids[0], best, MORE_TRIES * few, progress=phase(better), seed=2 * SEED, region=region)
     best = ranked(best, again)
     tested = concatenate([best, replace(rest, score=rest.score.clamp(max=float(best.score.min())))])
     others = [found.select(~wanted)] if not wanted.all() else []
-    path = bundled_path(name)
-    replace(concatenate([tested, *others]), settings=found.settings).save(path)
+    path = bundled_path(name, region)
+    settings = json.loads(found.settings or "{}") | {"ranking_steps": first.steps + again.steps}
+    replace(concatenate([tested, *others]), settings=json.dumps(settings)).save(path)
     bundle_feasibility_tables(name)
     return path
 
@@ -211,8 +226,9 @@ def bundle_feasibility_tables(name: str | Path) -> list[Path]:
         InputError: no such object, or it has no folder.
     """
     folder, kept = bundled_path(name).parent, []
-    for env_id in tasks_of(load_object(name)):
-        task = make_task(env_id, 1)
+    sets = ["affordance"] + ["grasps"] * bundled_path(name, region=False).is_file()
+    for env_id, guidance in itertools.product(tasks_of(load_object(name)), sets):
+        task = make_task(env_id, 1, guidance)
         table = task.arm.reach_table
         task.close()
         if table is not None:

@@ -69,7 +69,7 @@ class PairTask(Task):
         terms = {**near, "lift": raised, **penalties(PenaltyWeights(), 0.0005, 0.005)}
         return Mdp(stages, Terms(terms), Terms({"lift": raised, **paper_penalty()}), self.config.penetration_limit)
 
-    def candidates(self, arm: str) -> GraspCandidates:
+    def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
         return best_candidates("jug", "HandleGrasp", 0.5, 40) if arm == "left" else hand_made_candidates()
 
     def make_reference(self, scene: TaskScene, arm: str) -> Reference:

@@ -1,7 +1,8 @@
 """Rollouts of the tasks' wrist controller without a simulator: batched and purely kinematic.
 
-The wrist moves to the standoff of a candidate, above it while it still has to turn, and then straight along the approach. Each control step is a
-displacement of bounded length, turned into joint steps by damped least squares within position and velocity limits.
+The wrist moves to the standoff of a candidate, higher while it still has to turn, then straight along the approach.
+Each control step is a displacement of bounded length, turned into joint steps by damped least squares within position
+and velocity limits.
 The branch of the inverse kinematics, stalls at joint limits and slow motion near singularities are those of the task.
 """
 

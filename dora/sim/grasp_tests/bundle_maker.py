@@ -51,7 +51,9 @@ Usable = Callable[[GraspCandidates], Bool[Tensor, " c"]]
 """Function that returns the mask (c,) of grasps that a task can use."""
 
 
-def make_bundle(name: str, seed: int, phases: ProgressDisplay, usable: Usable | None = None) -> Path:
+def make_bundle(
+    name: str, seed: int, phases: ProgressDisplay, usable: Usable | None = None, region: bool = True
+) -> Path:
     """Make and write the bundled set of an object; returns the path of its file.
 
     Args:
@@ -60,12 +62,14 @@ def make_bundle(name: str, seed: int, phases: ProgressDisplay, usable: Usable | 
         phases: display of the progress.
         usable: mask of the grasps that the object's task can use. The best grasps of the target region are chosen among
             those; grasps of the other regions and unusable ones follow.
+        region: whether the search knows the target region. If not, nothing asks for a region or a class; rounds,
+            grasps that are ranked and grasps that are kept are as many.
 
     Raises:
         InputError: unknown object, one without a folder, or too few valid grasps.
     """
-    path = bundled_path(name)
-    SetMaker(load_object(name), load_robot(ROBOT), phases, usable).make(seed).save(path)
+    path, maker = bundled_path(name, region), SetMaker(load_object(name), load_robot(ROBOT), phases, usable)
+    (maker.make(seed) if region else maker.make_for_any_region(seed)).save(path)
     return path
 
 
@@ -84,43 +88,53 @@ class SetMaker:
         Raises:
             InputError: there are too few valid grasps of the target region.
         """
-        parts = [self.ranked(self.pool(seed)).select(slice(KEPT))]
+        parts = [self.ranked(self.pool(seed, self.obj.target)).select(slice(KEPT))]
         for index, label in enumerate(self.obj.labels):
             if label != self.obj.target or self.usable is not None:
                 found = self.valid(OTHERS, seed + MOST_ROUNDS + index, label)
                 parts += [] if found is None else [self.ranked(found).select(slice(OTHERS_KEPT))]
-        made = {"search": repr(Settings()), "grasp_test": repr(STANDARD), "ranking": repr(Execution()), "seed": seed}
-        return replace(concatenate(parts), settings=json.dumps(made))
+        return replace(concatenate(parts), settings=self._made(seed))
 
-    def pool(self, seed: int) -> GraspCandidates:
-        """Up to `POOL` valid grasps of the target region.
+    def make_for_any_region(self, seed: int) -> GraspCandidates:
+        """The best grasps of a search that knows no region; errors as of `make`."""
+        return replace(self.ranked(self.pool(seed, None)).select(slice(KEPT)), settings=self._made(seed))
+
+    def _made(self, seed: int) -> str:
+        made = {"search": repr(Settings()), "grasp_test": repr(STANDARD), "ranking": repr(Execution()), "seed": seed}
+        return json.dumps(made)
+
+    def pool(self, seed: int, label: str | None) -> GraspCandidates:
+        """Up to `POOL` valid grasps of a region, or of any.
 
         Raises:
             InputError: there are fewer than `FEWEST_GRASPS`.
         """
         sets: list[GraspCandidates] = []
         for index in range(MOST_ROUNDS):
-            found = self.valid(ROUND, seed + index, self.obj.target, self.usable)
+            found = self.valid(ROUND, seed + index, label, self.usable)
             sets += [] if found is None else [found]
             if sum(map(len, sets)) >= POOL:
                 break
         count = sum(map(len, sets))
         if count < FEWEST_GRASPS:
-            name, target = self.obj.name, self.obj.target
-            raise InputError(f"{name}: only {count} grasps of {target!r} are valid, and {FEWEST_GRASPS} are needed.")
+            name, where = self.obj.name, "any region" if label is None else repr(label)
+            raise InputError(f"{name}: only {count} grasps of {where} are valid, and {FEWEST_GRASPS} are needed.")
         return concatenate(sets).select(slice(POOL))
 
-    def valid(self, num: int, seed: int, label: str, usable: Usable | None = None) -> GraspCandidates | None:
-        """Those of `num` candidates that hold `label`, are usable, have a free approach, and are strictly valid.
+    def valid(self, num: int, seed: int, label: str | None, usable: Usable | None = None) -> GraspCandidates | None:
+        """Those of `num` candidates that hold `label` (None: anything), are usable, have a free approach, and are
+        strictly valid.
 
         Returns:
             The candidates; None if none is left.
         """
         found = optimise(
-            self.obj, self.robot, num, seed, label, progress=self.phase(f"search {label}", 1 / Settings().iterations)
-        )
-        name = self.obj.classes[self.obj.label_index(label)]
-        good = found.valid & (found.self_penetration < STANDARD.strict_self_penetration) & found.of_class(name)
+            self.obj, self.robot, num, seed, label,
+            progress=self.phase(f"search {label or 'any region'}", 1 / Settings().iterations),
+        )  # fmt: skip
+        good = found.valid & (found.self_penetration < STANDARD.strict_self_penetration)
+        if label is not None:
+            good &= found.of_class(self.obj.classes[self.obj.label_index(label)])
         good = good if usable is None else good & usable(found)
         if not good.any():
             return None
@@ -134,7 +148,7 @@ class SetMaker:
             if not feasible.any():
                 return None
             found = found.select(feasible)
-        verdict = validate(found, self.obj, self.robot, progress=self.phase(f"validate {label}"))
+        verdict = validate(found, self.obj, self.robot, progress=self.phase(f"validate {label or 'any region'}"))
         return found.select(verdict.strict) if verdict.strict.any() else None
 
     def ranked(self, candidates: GraspCandidates) -> GraspCandidates:

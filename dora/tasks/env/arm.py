@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dora.affordance.candidates import GraspCandidates
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.approach_paths import ReachSettings
 from dora.affordance.reach.feasibility import Reach
@@ -50,6 +51,7 @@ class Arm:
         name, spec, agent, guide: see the attributes.
         grid: where its object may stand, for the table of f_reach; None where it does not stand.
         tables: tables of f_reach by the name of the arm, which outlive a reconfiguration.
+        starts: candidates that decide where objects start; those of the guide if None.
 
     Attributes:
         name, spec: as the task says.
@@ -66,8 +68,10 @@ class Arm:
         guide: Guide,
         grid: Grid | None,
         tables: dict[str, ReachTable],
+        starts: GraspCandidates | None = None,
     ):
         self.name, self.spec, self.agent, self.guide, self._grid, self._tables = name, spec, agent, guide, grid, tables
+        self._starts = starts
         self.posture = agent.description.postures[start_posture(spec)]
         base = (torch.tensor([x], dtype=torch.float32, device=agent.device) for x in (spec.position, spec.quaternion))
         self.home: Pose = compose((next(base), next(base)), agent.posture_wrist(start_posture(spec)))
@@ -75,9 +79,17 @@ class Arm:
     @property
     def reach_table(self) -> ReachTable | None:
         """f_reach of the candidates over the places where the object may stand; None where it does not stand."""
-        if self._grid is not None and self.name not in self._tables:
-            self._tables[self.name] = tabulated_reach(self, self._grid)
-        return self._tables.get(self.name)
+        return self._table(self.name, self.guide.choice.candidates)
+
+    @property
+    def start_table(self) -> ReachTable | None:
+        """The same of the candidates that decide where the object starts."""
+        return self.reach_table if self._starts is None else self._table(f"{self.name}/starts", self._starts)
+
+    def _table(self, name: str, candidates: GraspCandidates) -> ReachTable | None:
+        if self._grid is not None and name not in self._tables:
+            self._tables[name] = tabulated_reach(self, self._grid, candidates)
+        return self._tables.get(name)
 
     @property
     def action_size(self) -> int:
@@ -159,8 +171,8 @@ class Arm:
         return torch.cat([step, controller.hand_action(target.hand)], -1)
 
 
-def tabulated_reach(arm: Arm, grid: Grid) -> ReachTable:
-    """f_reach of an arm's candidates over a grid of places, made once and cached on disk.
+def tabulated_reach(arm: Arm, grid: Grid, candidates: GraspCandidates) -> ReachTable:
+    """f_reach of candidates of an arm over a grid of places, made once and cached on disk.
 
     The motions are those of the arm's controller and reference in its task.
     """
@@ -174,5 +186,4 @@ def tabulated_reach(arm: Arm, grid: Grid) -> ReachTable:
         ),
         start=start_posture(arm.spec),
     )
-    candidates = arm.guide.choice.candidates.to("cpu")
-    return ReachTable.of(reach, candidates, grid, obj.support, obj.rest).to(arm.agent.device)
+    return ReachTable.of(reach, candidates.to("cpu"), grid, obj.support, obj.rest).to(arm.agent.device)

@@ -16,10 +16,15 @@ def observation_rows(env: Any) -> Rows:
     rows = [["index", "entry", "size", "unit", "meaning", "exists"]]
     for name, entry in env.observation_entries.items():
         size = entry.value(s).shape[-1]
-        who = "prior" if entry.prior else "guided" if entry.guided else "both"
+        who = "prior" if entry.prior else _with(entry)
         rows.append([f"{start}-{start + size - 1}", f"`{name}`", str(size), entry.unit, entry.doc, who])
         start += size
     return rows
+
+
+def _with(part: Any) -> str:
+    """With what guidance a term or entry exists."""
+    return "affordance" if part.region else "guided" if part.guided else "always"
 
 
 def stage_rows(env: Any) -> Rows:
@@ -35,7 +40,7 @@ def term_rows(env: Any) -> Rows:
     """The reward's terms in force."""
     rows = [["term", "part", "weight", "meaning", "exists"]]
     for name, term in env.terms.terms.items():
-        rows.append([f"`{name}`", term.part, f"{term.weight:g}", term.doc, "guided" if term.guided else "both"])
+        rows.append([f"`{name}`", term.part, f"{term.weight:g}", term.doc, _with(term)])
     return rows
 
 

@@ -33,7 +33,7 @@ from dora.tasks.env.state import resize, restore, saved_state
 from dora.tasks.env.task import Task
 from dora.tasks.guidance.guide import Guide
 from dora.tasks.mdp.config import TaskConfig
-from dora.tasks.mdp.guidance_parts import FILTER, REWARD
+from dora.tasks.mdp.guidance_parts import FILTER
 from dora.tasks.mdp.observations import observation_table
 from dora.tasks.mdp.rewards import Terms
 from dora.tasks.mdp.snapshot import Snapshot, advanced
@@ -47,8 +47,9 @@ class DoraEnv(BaseEnv):
     """The environment of one or several arms that has a task; one class per registered id, made by `register_task`.
 
     Args:
-        guidance: "affordance" puts candidates into observation, reward and action; "none" removes exactly that.
-        guidance_parts: which parts of guidance="affordance" are in force, among "observation", "reward", "filter"
+        guidance: "affordance" puts candidates and regions into observation, reward and action, "grasps" candidates of a
+            search that knows no region, "none" neither; see `dora.tasks.mdp.guidance_parts`.
+        guidance_parts: which parts of guidance are in force, among "observation", "reward", "filter"
             and "prior"; all by default.
         hand_joints: 20 independent hand targets, or 15 with distal joints coupled to medial ones.
         preset: how much episodes are randomised, see `dora.tasks.mdp.randomisation`.
@@ -150,7 +151,7 @@ class DoraEnv(BaseEnv):
         self.mdp = task.make_mdp(scene)
         self.machine = StageMachine(self.mdp.stages, self.num_envs, self.config.dt, self.device)
         terms = self.mdp.paper_terms if self._reward_mode == "paper" else self.mdp.terms
-        self.terms: Terms[Any] = terms if REWARD in self.parts else terms.without_guidance()
+        self.terms: Terms[Any] = terms.in_force(self.parts)
         self.observation_entries = observation_table(tuple(task.ARMS), self.mdp.observations, self.parts)
         agents = getattr(self.agent, "agents", [self.agent])
         scene.make_arms(task, agents, self.parts, self._grasps, self._tables)
@@ -333,8 +334,7 @@ class DoraEnv(BaseEnv):
         info.update({f"reward/{name}": weight * value for name, value in parts.items()})
         return weight * total
 
-    def compute_normalized_dense_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
-        """The dense reward over its largest possible value."""
+    def compute_normalized_dense_reward(self, obs: Any, action: Any, info: dict) -> Tensor:  # noqa: D102
         return self.compute_dense_reward(obs, action, info) / self.terms.upper
 
     def get_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
@@ -353,9 +353,7 @@ class DoraEnv(BaseEnv):
         return {name: entry.value(s) for name, entry in self.observation_entries.items()}
 
     def _flatten_raw_obs(self, obs: Any) -> Any:
-        if self._obs_mode == "state":
-            return torch.cat(list(obs["extra"].values()), -1)
-        return super()._flatten_raw_obs(obs)
+        return torch.cat([*obs["extra"].values()], -1) if self._obs_mode == "state" else super()._flatten_raw_obs(obs)
 
     # ------------------------------------------------ the protocol of learners
 
@@ -363,6 +361,11 @@ class DoraEnv(BaseEnv):
     def max_steps(self) -> int:
         """Episode limit [control steps]."""
         return self.task.MAX_STEPS
+
+    @property
+    def ranking_steps(self) -> int | None:
+        """Control steps that ranking the candidates took; None if they do not say or there are several arms."""
+        return self.guide.choice.candidates.ranking_steps if len(self.arms) == 1 else None
 
     @property
     def stage_names(self) -> tuple[str, ...]:

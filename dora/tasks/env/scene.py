@@ -28,6 +28,7 @@ from dora.tasks.guidance.candidate_choice import CandidateChoice
 from dora.tasks.guidance.guide import Guide
 from dora.tasks.guidance.residual_action import ResidualAction
 from dora.tasks.mdp.config import TaskConfig
+from dora.tasks.mdp.guidance_parts import REGION
 from dora.tasks.mdp.memory import EpisodeMemory, HandSizes
 from dora.tasks.mdp.snapshot import Snapshot
 from dora.tasks.mdp.stages import StageMachine
@@ -114,14 +115,17 @@ class TaskScene:
             grasps: candidates in place of the task's own.
             tables: tables of f_reach that are known already.
         """
+        region = REGION in parts or not parts
         for (name, spec), agent in zip(task.ARMS.items(), agents, strict=True):
-            found = task.candidates(name) if grasps is None else grasps
+            found = task.candidates(name, region) if grasps is None else grasps
             adapted = task.adapted(found, name, agent.description)
+            same = region or grasps is not None
+            starts = None if same else task.adapted(task.candidates(name), name, agent.description)
             choice = CandidateChoice(adapted, self.num_envs, self.device)
             size = int(np.prod(agent.single_action_space.shape or ()))
             residual = ResidualAction(self.num_envs, size, self.config.residual, self.device)
             guide = Guide(parts, choice, task.make_reference(self, name), residual)
-            self.arms[name] = Arm(name, spec, agent, guide, task.start_grid(name), tables)
+            self.arms[name] = Arm(name, spec, agent, guide, task.start_grid(name), tables, starts)
 
     def make_reader(self, task: Task) -> None:
         """Makes the reader, when arms and objects are built."""

@@ -19,10 +19,14 @@ from dora.tasks.guidance.grasp_and_lift import GraspReference
 from dora.tasks.guidance.reference import Reference
 from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.mdp import Mdp
+from dora.tasks.mdp.quantities import off_table, opposed
 from dora.tasks.mdp.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from dora.tasks.env.scene import TaskScene
+
+HELD_RISE = 0.1
+"""Rise of an object that is held up [m]."""
 
 
 class Task(ABC):
@@ -66,9 +70,19 @@ class Task(ABC):
     def place(self, scene: "TaskScene", rows: Int[Tensor, " b"], u: Float[Tensor, "b d"]) -> None:
         """Puts the objects of the environments `rows` where `u` (b, DRAWS) in [0, 1) says."""
 
-    def candidates(self, arm: str) -> GraspCandidates:
-        """Grasps with which an arm may handle its object; all that come with the object by default."""
-        return load_candidates(self.ARMS[arm].object)
+    def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
+        """Grasps with which an arm may handle its object; all that come with the object by default.
+
+        Args:
+            arm: its name.
+            region: those of a search for the target region, or of one that knows no region (`guidance="grasps"`).
+        """
+        return load_candidates(self.ARMS[arm].object, region=region)
+
+    def held(self, s: Any) -> Bool[Tensor, " n"]:
+        """The object is in the hand and off the ground, whatever region of it is held: what grasps of a search that
+        knows no region are ranked by. Asked for one arm only."""
+        return opposed(s) & off_table(s, HELD_RISE)
 
     def adapted(self, candidates: GraspCandidates, arm: str, robot: RobotDescription) -> GraspCandidates:
         """The same grasps as an arm executes them in this task."""
@@ -102,6 +116,13 @@ class Task(ABC):
             return table.mask(object_p, object_q)
         count = len(arm.guide.choice.candidates)
         return torch.ones(len(object_p), count, dtype=torch.bool, device=object_p.device)
+
+    def startable(
+        self, arm: Arm, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]
+    ) -> Bool[Tensor, "b c"]:
+        """f_reach of the candidates that decide where objects start, which are the same with all guidance."""
+        table = arm.start_table
+        return self.reachable(arm, object_p, object_q) if table is None else table.mask(object_p, object_q)
 
     def extended(self, s: Snapshot) -> Snapshot:
         """The snapshot with what this task reads in addition: a subclass of `Snapshot`. Changes nothing."""

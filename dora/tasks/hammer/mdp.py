@@ -82,7 +82,7 @@ def terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
         {
             "affordance": Term(
                 lambda s: near_region(tip_distance(s)), w.affordance, "affordance", True,
-                "exp(-alpha * sum of fingertip distances to the handle)",
+                "exp(-alpha * sum of fingertip distances to the handle)", region=True,
             ),
             "candidate": Term(
                 lambda s: at_candidate(s, s.stage >= ORIENT), w.candidate, "task", True,

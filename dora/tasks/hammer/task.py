@@ -32,6 +32,7 @@ from dora.tasks.hammer.reference import CatchReference, CatchSettings
 from dora.tasks.hammer.snapshot import (
     HammerSnapshot,
     face_to_nail,
+    fingers_on,
     handle_axis,
     nail_in_hand,
     striking_axis,
@@ -181,8 +182,12 @@ class HammerTask(Task):
         c: HammerConfig = self.config
         return Mdp(stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS, partial(failed, c=c))
 
-    def candidates(self, arm: str) -> GraspCandidates:
-        return best_candidates("hammer", CLASS, self.config.fewest_catches, self.config.most_candidates)
+    def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
+        return best_candidates("hammer", CLASS, self.config.fewest_catches, self.config.most_candidates, region)
+
+    def held(self, s: HammerSnapshot) -> Bool[Tensor, " n"]:
+        """Two fingers touch the hammer, which has not fallen."""
+        return (fingers_on(s) >= 2) & (s.object.p[:, 2] > self.config.fallen)
 
     def adapted(self, candidates: GraspCandidates, arm: str, robot: RobotDescription) -> GraspCandidates:
         """The hand waits wide open, in the posture in which the arm starts."""
@@ -300,9 +305,9 @@ OBSERVATIONS: dict[str, Entry] = {
     "nail": Entry(nail_in_hand, "m", "the nail's head in the hand frame"),
     "nail_depth": Entry(_nail_depths, "cm", "depth of the nail, and how much of it blows have driven"),
     "drift": Entry(_drifts, "dm, rad", "motion of the hammer in the hand within 0.25 s"),
-    "handle": Entry(tip_distance, "m", "distance of each fingertip's surface from the handle's", True),
-    "face": Entry(face_to_nail, "m", "striking face to the nail's head, world frame", True),
-    "axes": Entry(_axes, "1", "striking and handle axis, world frame", True),
-    "nail_axis": Entry(_nail_axis, "1", "nail axis in the hand frame", True),
+    "handle": Entry(tip_distance, "m", "distance of each fingertip's surface from the handle's", True, region=True),
+    "face": Entry(face_to_nail, "m", "striking face to the nail's head, world frame", True, region=True),
+    "axes": Entry(_axes, "1", "striking and handle axis, world frame", True, region=True),
+    "nail_axis": Entry(_nail_axis, "1", "nail axis in the hand frame", True, region=True),
 }
 """What the task observes beyond the common entries; the guided ones are the affordance frame."""

@@ -1,18 +1,26 @@
-"""The parts of guidance: what affordances and candidates add to a task, one by one."""
+"""The ladder of guidance, and its parts: what candidates and affordances add to a task, one by one.
+
+none        the raw action: no candidates, no reference, no region
+grasps      candidates of a search that knows no region, as prior, filter, observation and reward
+affordance  candidates that hold the target region, and that region in observation and reward
+"""
 
 from collections.abc import Sequence
 
 from dora.errors import InputError
 
-GUIDANCE = ("affordance", "none")
+GUIDANCE = ("affordance", "grasps", "none")
 """Values of the switch `guidance`."""
 OBSERVATION, REWARD, FILTER, PRIOR = PARTS = ("observation", "reward", "filter", "prior")
 """The parts of guidance: features in the observation, terms of the reward, choice among reachable candidates only,
 and the reference to which the action is a residual."""
+REGION = "region"
+"""In force with `guidance="affordance"`: candidates, observation and reward know the object's regions."""
 
 
 def guidance_in_force(guidance: str, parts: Sequence[str] | None) -> frozenset[str]:
-    """The parts of guidance that a task has: all of them, or those that are named; none with `guidance="none"`.
+    """The parts of guidance that a task has: all of them, or those that are named, and `REGION` where affordances are
+    used; none with `guidance="none"`.
 
     Raises:
         InputError: for an unknown guidance or part, or parts of no guidance.
@@ -23,9 +31,13 @@ def guidance_in_force(guidance: str, parts: Sequence[str] | None) -> frozenset[s
         if parts:
             raise InputError('guidance="none" has no parts; leave guidance_parts out, or choose guidance="affordance"')
         return frozenset()
-    if parts is None:
-        return frozenset(PARTS)
-    named = (parts,) if isinstance(parts, str) else tuple(parts)
+    named = PARTS if parts is None else (parts,) if isinstance(parts, str) else tuple(parts)
     if unknown := set(named) - set(PARTS):
         raise InputError(f"unknown guidance part {sorted(unknown)[0]!r}; choose among {', '.join(PARTS)}")
-    return frozenset(named)
+    return frozenset(named) | ({REGION} if guidance == "affordance" else frozenset())
+
+
+def exists(part: str | None, region: bool, parts: frozenset[str]) -> bool:
+    """Whether something that belongs to a part of guidance (None: to the task itself) and, if `region`, to what
+    affordances add to it, exists with these parts."""
+    return (part is None or part in parts) and (not region or REGION in parts)

@@ -13,7 +13,7 @@ from dora.geometry.rotations import (
     quaternion_inverse,
     quaternion_multiply,
 )
-from dora.tasks.mdp.guidance_parts import OBSERVATION, PRIOR
+from dora.tasks.mdp.guidance_parts import OBSERVATION, PRIOR, exists
 from dora.tasks.mdp.quantities import goal_error, in_wrist, lifted, nearest_errors, turned_in_wrist
 from dora.tasks.mdp.snapshot import Snapshot
 
@@ -30,6 +30,7 @@ class Entry:
         unit: unit of the values, "1" if dimensionless.
         doc: what it is, for the documentation table.
         guided: True if it exists only with guidance.
+        region: True if it exists only with `guidance="affordance"`, because it knows the object's regions.
         prior: True if it is about the reference to which the action is a residual; it exists only with that part of
             guidance, all other guided entries belong to the part "observation".
     """
@@ -39,10 +40,12 @@ class Entry:
     doc: str
     guided: bool = False
     prior: bool = False
+    region: bool = False
 
     def exists(self, parts: frozenset[str]) -> bool:
         """Whether the entry exists with these parts of guidance."""
-        return not self.guided or (PRIOR if self.prior else OBSERVATION) in parts
+        part = None if not self.guided else PRIOR if self.prior else OBSERVATION
+        return exists(part, self.region, parts)
 
 
 def observation_table(arms: Sequence[str], extra: Mapping[str, Entry], parts: frozenset[str]) -> dict[str, Entry]:

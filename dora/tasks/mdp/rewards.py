@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dora.tasks.mdp.guidance_parts import REWARD, exists
+
 S = TypeVar("S")
 """A task's snapshot type: a frozen dataclass of tensors whose first axis is the environment."""
 
@@ -28,7 +30,8 @@ class Term(Generic[S]):
         value: snapshot -> dimensionless (n,) tensor in [0, 1].
         weight: share in the reward; negative for a penalty.
         part: which part of the paper's schema the term belongs to.
-        guided: True if the term exists only with `guidance="affordance"`.
+        guided: True if the term exists only with guidance.
+        region: True if it exists only with `guidance="affordance"`, because it knows the object's regions.
         doc: one sentence for the task's documentation table.
     """
 
@@ -37,6 +40,7 @@ class Term(Generic[S]):
     part: Part = "task"
     guided: bool = False
     doc: str = ""
+    region: bool = False
 
 
 class Terms(Generic[S]):
@@ -56,9 +60,10 @@ class Terms(Generic[S]):
         self.lower = sum(min(t.weight, 0.0) for t in self.terms.values())
         self.upper = sum(max(t.weight, 0.0) for t in self.terms.values())
 
-    def without_guidance(self) -> "Terms[S]":
-        """The same reward without the terms that affordance guidance adds."""
-        return Terms({name: t for name, t in self.terms.items() if not t.guided})
+    def in_force(self, parts: frozenset[str]) -> "Terms[S]":
+        """The same reward with those terms alone that exist with these parts of guidance."""
+        kept = {n: t for n, t in self.terms.items() if exists(REWARD if t.guided else None, t.region, parts)}
+        return Terms(kept)
 
     def __call__(self, s: S) -> tuple[Float[Tensor, " n"], dict[str, Float[Tensor, " n"]]]:
         """Returns the sum over all terms and each term's weighted value by name."""

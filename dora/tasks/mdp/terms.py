@@ -45,8 +45,19 @@ def finger_contacts(s: Snapshot) -> Float[Tensor, " n"]:
     return 0.6 * opposed(s).float() + 0.1 * s.hand.touch[:, 1:-1].sum(-1)
 
 
+def while_active(stage: int, value: Value) -> Value:
+    """A term of one sub-task: 0 before its stage, `value` while it is active, 1 after it; the reward follows the
+    active sub-task (paper, "Task-Specific Rewards") and no stage that is done takes anything away."""
+
+    def term(s: Snapshot) -> Tensor:
+        now = torch.where(s.stage == stage, value(s), 0.0)
+        return torch.where(s.stage > stage, 1.0, now)
+
+    return term
+
+
 def effort(s: Snapshot) -> Float[Tensor, " n"]:
-    """Mean square of the action."""
+    """R_penalty as printed, sum_i action_i^2, over its largest value, the number of components."""
     return s.action.square().mean(-1).clamp(max=1)
 
 
@@ -69,7 +80,7 @@ def penalties(weights: Any, free: float, limit: float) -> dict[str, Term[Any]]:
         limit: largest overlap of an episode that counts as a success [m].
     """
     return {
-        "effort": Term(effort, weights.effort, "penalty", doc="mean square of the action"),
+        "effort": Term(effort, weights.effort, "penalty", doc="sum of action^2, over the number of its components"),
         "change": Term(change, weights.change, "penalty", doc="mean square of the action's change"),
         "penetration": Term(
             overlap(free, limit), weights.penetration, "penalty", doc=f"overlap beyond {1000 * free:g} mm"
@@ -80,7 +91,7 @@ def penalties(weights: Any, free: float, limit: float) -> dict[str, Term[Any]]:
 def paper_affordance(point: Callable[[Any], Float[Tensor, "n 3"]]) -> dict[str, Term[Any]]:
     """The printed R_affordance, to one point of the region [m]."""
     doc = "exp(-alpha sum ||p_tip - p_afford||)"
-    return {"affordance": Term(lambda s: near_point(s, point(s)), 1.0, "affordance", True, doc)}
+    return {"affordance": Term(lambda s: near_point(s, point(s)), 1.0, "affordance", True, doc, region=True)}
 
 
 def paper_grasp(stages: int) -> dict[str, Term[Any]]:
