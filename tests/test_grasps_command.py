@@ -179,7 +179,7 @@ def test_searches_by_region_and_the_votes(
     bundled = GraspCandidates.load(bundled_path("jug"))
     asked = []
 
-    def search(obj, robot, num, seed, region, settings, progress) -> GraspCandidates:
+    def search(obj, robot, num, seed, region, settings, progress, kinematics) -> GraspCandidates:
         asked.append((region, num))
         return bundled.select(slice(num))
 

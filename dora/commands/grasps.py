@@ -18,6 +18,7 @@ import tyro
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.importing import import_object
+from dora.affordance.search.backends import Kinematics
 from dora.errors import InputError
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
@@ -62,6 +63,8 @@ class Args:
     """Close the hand and pull along six directions in SAPIEN, or only measure penetration."""
     baselines: int = 64
     """Candidates of each baseline; 0 leaves the baselines out."""
+    kinematics: Kinematics = "compiled"
+    """Search in compiled loops, or by automatic differentiation through pytorch_kinematics (slower)."""
     by_region: int = 0
     """Candidates of a search for each other region and of a free one, simulated as well: how often each region is held
     with and without asking for it, and how well the vote tells (needs --validate sapien)."""
@@ -106,16 +109,18 @@ def run(args: Args) -> None:
     check_out(out)
     simulate = args.validate == "sapien"
     with ProgressDisplay() as phases:
-        generated = generate(obj, robot, args.num, args.seed, region, phases, simulate)
+        generated = generate(obj, robot, args.num, args.seed, region, phases, simulate, kinematics=args.kinematics)
         report = summary(generated)
         searches = {}
         if args.by_region:
-            searches = by_region(obj, robot, args.by_region, args.seed, region, phases)
+            searches = by_region(obj, robot, args.by_region, args.seed, region, phases, args.kinematics)
             report["by_region"] = {name: summary(found) for name, found in searches.items()}
         if simulate:
             report["voting"] = voting_summary([generated, *searches.values()], obj)
         if args.baselines:
-            report["baselines"] = baselines(obj, robot, args.baselines, args.seed, region, phases, simulate)
+            report["baselines"] = baselines(
+                obj, robot, args.baselines, args.seed, region, phases, simulate, args.kinematics
+            )
     print_report(report)
     write_report(report, generated.candidates, out)
     print(out)
@@ -125,6 +130,8 @@ def remake(args: Args) -> None:
     """Make or rank the bundled set of an object."""
     if args.object is None or args.mesh is not None:
         raise InputError("--make-bundle and --rank-in-task need --object, for example --object jug, and no --mesh.")
+    if args.kinematics != "compiled":
+        raise InputError(f"--kinematics {args.kinematics} is for searches, not for --make-bundle or --rank-in-task.")
     name = args.object
     ids = tasks_of(load_object(name))
     with ProgressDisplay() as phases:
