@@ -52,6 +52,7 @@ def script() -> ModuleType:
         ("--object hamer", "no object 'hamer'; did you mean hammer? choose one of: cube, hammer, jug, microwave"),
         ("--make-bundle", "need --object"),
         ("--rank-in-task --mesh a.stl", "need --object"),
+        ("--make-bundle --object cube --kinematics pytorch_kinematics", "is for searches, not for --make-bundle"),
         ("--rank-in-task --object spoon", "no object 'spoon'"),
         ("--rank-in-task --object microwave", "no task uses the object 'microwave'"),
     ],
@@ -70,7 +71,7 @@ def test_bad_input(
     assert captured.out == ""
 
 
-@pytest.mark.parametrize("arguments", ["--validate isaac", "--ship", "--no-such-option 1"])
+@pytest.mark.parametrize("arguments", ["--validate isaac", "--kinematics newton", "--ship", "--no-such-option 1"])
 def test_errors_of_the_parser(script: ModuleType, monkeypatch: pytest.MonkeyPatch, arguments: str):
     with pytest.raises(SystemExit) as exit_info:
         call(script, monkeypatch, *arguments.split())

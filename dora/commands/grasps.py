@@ -110,7 +110,7 @@ def run(args: Args) -> None:
     simulate = args.validate == "sapien"
     with ProgressDisplay() as phases:
         generated = generate(obj, robot, args.num, args.seed, region, phases, simulate, kinematics=args.kinematics)
-        report = summary(generated)
+        report = summary(generated) | {"kinematics": args.kinematics}
         searches = {}
         if args.by_region:
             searches = by_region(obj, robot, args.by_region, args.seed, region, phases, args.kinematics)

@@ -32,6 +32,7 @@ from dora.affordance.search.native.parts import PARTS, repeat
 from dora.affordance.search.optimise import optimise, seated, table_of
 from dora.affordance.search.quasi_static_closing import close_hand
 from dora.affordance.search.search import Search, Settings
+from dora.parallel import one_thread
 from dora.robot import RobotDescription
 
 NUM = 256
@@ -128,12 +129,8 @@ def measure(name: str, robot: RobotDescription, settings: Settings | None = None
     Raises:
         InputError: there is no such object.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_thread():
         return _measure(load_object(name), robot, settings or Settings())
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _measure(obj: AffordanceObject, robot: RobotDescription, settings: Settings) -> GraspBenchmark:

@@ -15,6 +15,7 @@ from dora.affordance.search.energies import TERMS, Evaluation, GraspEnergy, Tabl
 from dora.affordance.search.grasp_state import GraspState
 from dora.affordance.search.torch_energies import ENERGIES, ExtraEnergies
 from dora.errors import InputError
+from dora.parallel import one_thread
 
 
 class DifferentiableEnergy(GraspEnergy):
@@ -49,6 +50,7 @@ class DifferentiableEnergy(GraspEnergy):
         self._functions = {name: ENERGIES[name] for name in self.names}
         self._functions |= {name: function for name, (_, function) in self.extra.items()}
 
+    @one_thread()
     def __call__(
         self,
         wrist: Float[Tensor, "c 4 4"],
@@ -96,6 +98,7 @@ class DifferentiableDescent(Descent):
 
     energy: DifferentiableEnergy
 
+    @one_thread()
     def __call__(self, rows: Rows, schedule: Schedule) -> None:
         """Move rows in place, as `Descent.__call__`."""
         move = torch.zeros_like(rows.mean, requires_grad=True)

@@ -55,7 +55,7 @@ class GraspState:
         return self.hand.all_joints(self.joints)
 
     @cached_property
-    def _both(self) -> Float[Tensor, "2c b 4 4"]:
+    def _both(self) -> Tensor:
         joints = torch.cat((self.joints, self.joints + self.energy.close))
         return self.hand.forward(torch.cat((self.wrist, self.wrist)), joints)
 
