@@ -180,6 +180,8 @@ def test_an_energy_of_a_user_acts_and_is_stored():
         ("pytorch_kinematics", {"pointing": (float("nan"), POINTING)}, "the weight of the energy 'pointing' is nan"),
         ("pytorch_kinematics", {"all": (1.0, lambda s: s.joints)}, "the energy 'all' returned (16, 15), not"),
         ("pytorch_kinematics", {"one": (1.0, lambda s: 0.0)}, "the energy 'one' returned float, not a tensor"),
+        ("pytorch_kinematics", {"log": (1.0, lambda s: s.joints.sum(1) / 0)}, "the energy 'log' returned a value that"),
+        ("pytorch_kinematics", {"root": (1.0, lambda s: (s.joints.sum(1) * 0).sqrt())}, "energies root is not finite"),
     ],
 )
 def test_what_there_is_not_is_refused_in_one_sentence(kinematics: str, energies: dict, words: str):

@@ -63,9 +63,9 @@ class DifferentiableEnergy(GraspEnergy):
             move = joints.new_zeros(len(joints), 6 + joints.shape[1], requires_grad=True)
             total, terms = self.value(_turned(wrist, move), joints + move[:, 6:], contacts, ramp)
             total.sum().backward()
-        assert move.grad is not None
+        gradient = self.checked(move.grad)
         values = {name: value.detach() for name, value in terms.items()}
-        return Evaluation(total.detach(), values, move.grad[:, :6], move.grad[:, 6:])
+        return Evaluation(total.detach(), values, gradient[:, :6], gradient[:, 6:])
 
     def value(
         self,
@@ -77,16 +77,26 @@ class DifferentiableEnergy(GraspEnergy):
         """Weighted sum and unweighted terms by name, both differentiable; arguments as for `GraspEnergy.__call__`.
 
         Raises:
-            InputError: a further energy returns anything but one number per candidate.
+            InputError: a further energy returns anything but one finite number per candidate.
         """
         state = GraspState(self, wrist, joints, contacts)
         terms = {name: function(state) for name, function in self._functions.items()}
         for name in self.extra:
-            if not isinstance(terms[name], Tensor) or terms[name].shape != (len(joints),):
-                found = tuple(terms[name].shape) if isinstance(terms[name], Tensor) else type(terms[name]).__name__
-                raise InputError(f"the energy {name!r} returned {found}, not a tensor of shape ({len(joints)},).")
+            _check_value(name, terms[name], len(joints))
         factor = self.ramped_weights(ramp) | {name: weight for name, (weight, _) in self.extra.items()}
         return torch.stack([factor[name] * value for name, value in terms.items()]).sum(0), terms
+
+    def checked(self, gradient: Tensor | None) -> Tensor:
+        """A gradient (c, m) that is finite.
+
+        Raises:
+            InputError: it is not, by a further energy.
+        """
+        assert gradient is not None
+        if self.extra and not torch.isfinite(gradient).all():
+            names = ", ".join(self.extra)
+            raise InputError(f"the gradient with the energies {names} is not finite; mind roots and norms at zero.")
+        return gradient
 
 
 class DifferentiableDescent(Descent):
@@ -113,11 +123,21 @@ class DifferentiableDescent(Descent):
                 wrist, joints = _turned(rows.wrist, step), rows.joints + step[:, 6:]
                 total, terms = self.energy.value(wrist, joints, rows.contacts, ramp)
                 total.sum().backward()
+            self.energy.checked(move.grad)
             rows.total, rows.overlap = total.detach(), overlap(terms).detach()
             adam.step()
             with torch.no_grad():
                 rows.move(self.largest * move)
                 move.zero_()
+
+
+def _check_value(name: str, value: object, count: int) -> None:
+    """Refuse what an energy of a user returned for `count` candidates, unless it is one finite number for each."""
+    if not isinstance(value, Tensor) or value.shape != (count,):
+        found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        raise InputError(f"the energy {name!r} returned {found}, not a tensor of shape ({count},).")
+    if not torch.isfinite(value).all():
+        raise InputError(f"the energy {name!r} returned a value that is not finite.")
 
 
 def _turned(wrist: Tensor, move: Tensor) -> Tensor:
