@@ -2,11 +2,12 @@
 
 import dataclasses
 import functools
+import itertools
 import multiprocessing
 import os
 from collections.abc import Callable
 from multiprocessing.process import BaseProcess
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import torch
@@ -14,8 +15,10 @@ from fake_task import PointMass
 from torch import Tensor
 
 from dora.agents.config import PPOConfig, RunConfig
+from dora.agents.evaluation.evaluate import FINAL_SEED, MOST_SEEDS, PERIODIC_SEED, STARTS, first_seed
 from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.learner import make_learner
+from dora.agents.runs.trainer import TRAINING_SEEDS
 from dora.errors import InputError
 
 EPISODES = 30
@@ -29,6 +32,20 @@ FAILURES: dict[str, Callable[[], Any]] = {
     "refuses": lambda: (_ for _ in ()).throw(InputError("The action is NaN.")),
 }
 """What a step does in a helper."""
+
+
+class Judging(PointMass):
+    """A task that reports all that evaluation understands: overlap beside success, the end, the simulator's health."""
+
+    logged = (*PointMass.logged, "raw_success", "success_at_end", "nonfinite")
+    ranking_steps = 1234
+
+    def step(self, action: Tensor) -> Any:
+        *rest, info = super().step(action)
+        row = torch.arange(self.num_envs)
+        first = self.elapsed_steps == 1
+        info |= {"success": row < 4, "raw_success": row < 6, "success_at_end": row < 2, "nonfinite": first & (row == 7)}
+        return *rest, info
 
 
 class FailsElsewhere(PointMass):
@@ -50,10 +67,7 @@ def helpers() -> list[BaseProcess]:
 
 
 def test_processes_give_the_rows_of_one_process():
-    alone, shared = (
-        Evaluators(functools.partial(PointMass, CONFIG.eval_envs), dataclasses.replace(CONFIG, workers=workers))
-        for workers in (1, 2)
-    )
+    alone, shared = (Evaluators(PointMass, dataclasses.replace(CONFIG, workers=workers)) for workers in (1, 2))
     torch.manual_seed(0)
     policy = make_learner(CONFIG, *alone.sizes).policy
     for acting in (policy, None):
@@ -69,6 +83,70 @@ def test_processes_give_the_rows_of_one_process():
     assert not helpers()
 
 
+class Counted(PointMass):
+    """A task that notes how many environments each copy has, and how often they are stepped."""
+
+    made: ClassVar[list[int]] = []
+    steps: ClassVar[list[int]] = []
+
+    def __init__(self, num_envs: int):
+        super().__init__(num_envs)
+        self.made.append(num_envs)
+
+    def step(self, action: Tensor) -> Any:
+        self.steps.append(self.num_envs)
+        return super().step(action)
+
+
+@pytest.mark.parametrize(("episodes", "sizes"), [(3, [3]), (8, [8]), (19, [8, 3]), (1, [2]), (17, [8, 2])])
+def test_no_more_episodes_are_simulated_than_asked_for(episodes: int, sizes: list[int]):
+    """But for a last one alone, which has a companion."""
+    Counted.made.clear()
+    Counted.steps.clear()
+    evaluators = Evaluators(Counted, dataclasses.replace(CONFIG, workers=1), episodes)
+    evaluation = evaluators.run(None, episodes, 100)
+    assert len(evaluation.table) == episodes
+    assert Counted.made == sizes
+    assert sum(Counted.steps) == 16 * (episodes + (episodes % 8 == 1))
+    evaluators.close()
+
+
+def test_a_row_does_not_depend_on_the_number_of_episodes():
+    evaluators = Evaluators(PointMass, dataclasses.replace(CONFIG, workers=1))
+    torch.manual_seed(0)
+    policy = make_learner(CONFIG, *evaluators.sizes).policy
+    for acting in (policy, None):
+        most = evaluators.run(acting, 24, 100).table
+        for episodes in (1, 2, 3, 9, 23):
+            assert torch.equal(evaluators.run(acting, episodes, 100).table, most[:episodes])
+    evaluators.close()
+
+
+def test_what_a_task_reports_is_counted():
+    evaluators = Evaluators(Judging, dataclasses.replace(CONFIG, workers=1))
+    evaluation = evaluators.run(None, 8, 0)
+    rates = evaluation.success_rate, evaluation.raw_success_rate, evaluation.success_at_end_rate
+    assert rates == (0.5, 0.75, 0.25)
+    assert (evaluation.nonfinite_episodes, evaluation.ranking_steps, evaluation.first_seed) == (1, 1234, 0)
+    assert evaluation.success_interval == pytest.approx((0.2152, 0.7848), abs=1e-4)
+    evaluators.close()
+    plain = Evaluators(PointMass, dataclasses.replace(CONFIG, workers=1))
+    evaluation = plain.run(None, 8, 0)
+    assert (evaluation.raw_success_rate, evaluation.nonfinite_episodes, evaluation.ranking_steps) == (None, 0, None)
+    assert evaluation.success_at_end_rate == evaluation.success_rate
+    plain.close()
+
+
+def test_seeds_of_evaluations_do_not_meet():
+    ranges = [(0, TRAINING_SEEDS), (PERIODIC_SEED, PERIODIC_SEED + STARTS), (FINAL_SEED, FINAL_SEED + STARTS)]
+    ranges += [(first := first_seed(seed, STARTS), first + STARTS) for seed in (0, 1, 2, 7, MOST_SEEDS - 1)]
+    assert all(before <= after for (_, before), (after, _) in itertools.pairwise(ranges))
+    assert ranges[-1][1] <= 2**32
+    for seed, episodes in ((-1, 1), (MOST_SEEDS, 1), (0, STARTS + 1)):
+        with pytest.raises(InputError, match="starts"):
+            first_seed(seed, episodes)
+
+
 @pytest.mark.parametrize(
     ("failure", "error", "message"),
     [
@@ -78,7 +156,7 @@ def test_processes_give_the_rows_of_one_process():
     ],
 )
 def test_a_failing_helper_is_reported_and_ended(failure: str, error: type[Exception], message: str):
-    make = functools.partial(FailsElsewhere, CONFIG.eval_envs, os.getpid(), failure)
+    make = functools.partial(FailsElsewhere, home=os.getpid(), failure=failure)
     evaluators = Evaluators(make, CONFIG)
     with pytest.raises(error, match=message):
         evaluators.run(None, EPISODES, 0)
@@ -90,7 +168,7 @@ def test_an_interrupt_ends_the_helpers():
     def interrupted() -> None:
         raise KeyboardInterrupt
 
-    evaluators = Evaluators(functools.partial(PointMass, CONFIG.eval_envs), CONFIG)
+    evaluators = Evaluators(PointMass, CONFIG)
     with pytest.raises(KeyboardInterrupt):
         evaluators.run(None, EPISODES, 0, interrupted)
     assert not helpers()
@@ -98,7 +176,7 @@ def test_an_interrupt_ends_the_helpers():
 
 
 def test_a_helper_that_is_gone_is_reported():
-    evaluators = Evaluators(functools.partial(PointMass, CONFIG.eval_envs), CONFIG)
+    evaluators = Evaluators(PointMass, CONFIG)
     evaluators.run(None, EPISODES, 0)
     [helper] = helpers()
     helper.kill()

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -10,18 +11,21 @@ from typing import Any
 import pytest
 import yaml
 from commands import call, load_command
+from fake_task import PointMass
 
 import dora.agents
 from dora.agents.checkpoint import read_checkpoint
-from dora.agents.config import LEARNER_CONFIGS
+from dora.agents.config import LEARNER_CONFIGS, config_from_dict
+from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed
 from dora.agents.evaluation.play import load_policy
 from dora.agents.runs.recommended import recommended
 from dora.agents.runs.run_folder import RunFolder
 from dora.commands import run
 from dora.configs import plain
+from dora.digests import digest_of
 from dora.errors import InputError
 from dora.tasks import find_task, make_task
-from dora.tasks.cube import CubeConfig
+from dora.tasks.cube import CubeConfig, paper_terms
 from dora.tasks.env.options import task_config
 from dora.tasks.mdp.randomisation import PRESETS
 
@@ -49,6 +53,10 @@ def script() -> ModuleType:
         ("--env DoraCube-v1 --agent mappo", "use --agent with one of ppo, sac"),
         ("--resume /nowhere", "not a run folder"),
         ("--eval-only", "--checkpoint"),
+        ("--eval-only --zero-correction", "--env"),
+        ("--eval-only --zero-correction --env DoraCube-v1 --guidance none", "nothing to correct"),
+        ("--eval-only --zero-correction --env DoraCube-v1 --seed 200000", "seeds from 0 to 199999"),
+        ("--eval-only --zero-correction --env DoraCube-v1 --seed 1 --episodes 10001", "10000 starts"),
         ("--eval-only --checkpoint /nowhere.safetensors", "no checkpoint"),
         ("--env DoraCube-v1 --checkpoint missing", "--eval-only"),
     ],
@@ -179,7 +187,91 @@ def test_a_bundled_policy_can_be_evaluated_alone(
     captured = capsys.readouterr()
     assert captured.out == f"{tmp_path / 'eval'}\n"
     assert "evaluation on 4 episodes" in captured.err
-    assert "success 1.000, without any correction 1.000" in captured.err
+    assert "success 1.000 [0.510, 1.000], penetration" in captured.err
     result = json.loads((tmp_path / "eval" / "result.json").read_text())
     assert (result["success_rate"], result["eval_episodes"], result["preset"]) == (1.0, 4, "none")
     assert result["workers"] == 1
+    assert (result["zero_success_rate"], result["first_seed"]) == (None, FINAL_SEED)
+    assert result["success_interval"] == pytest.approx([0.5101, 1.0], abs=1e-4)
+    assert (result["raw_success_rate"], result["success_at_end_rate"], result["nonfinite_episodes"]) == (1.0, 1.0, 0)
+    assert 0 < result["steps_to_50"] <= result["steps_to_80"] <= result["env_steps"]
+
+
+@pytest.fixture
+def point_mass(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands get a point mass in place of the task that they name."""
+    monkeypatch.setattr(run, "make_task", lambda env, num_envs, **options: PointMass(num_envs))
+
+
+def rows(folder: Path) -> list[str]:
+    """Lines of the episodes of an evaluation."""
+    return (folder / "eval.csv").read_text().splitlines()[1:]
+
+
+@pytest.mark.usefixtures("point_mass")
+def test_a_seed_chooses_the_starts_of_an_evaluation(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    words = "--env DoraCube-v1 --total-steps 2048 --num-envs 16 --workers 0 --episodes 5 --no-zero-correction --out"
+    assert call(script, monkeypatch, *words.split(), str(tmp_path / "run")) == 0
+    trained = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert trained["zero_success_rate"] is None
+    evaluate = ["--eval-only", "--checkpoint", str(tmp_path / "run"), "--workers", "1"]
+    more = {"same": "", "a": "--seed 3", "b": "--seed 3 --episodes 9 --zero-correction", "c": "--seed 4"}
+    for name, options in more.items():
+        assert call(script, monkeypatch, *evaluate, "--out", str(tmp_path / name), *options.split()) == 0
+    results = {name: json.loads((tmp_path / name / "result.json").read_text()) for name in more}
+    assert rows(tmp_path / "same") == rows(tmp_path / "run")  # without a seed those of the end of training
+    assert rows(tmp_path / "a") == rows(tmp_path / "b")[:5]
+    assert len({rows(tmp_path / name)[0] for name in ("same", "a", "c")}) == 3
+    assert [results[name]["zero_success_rate"] is None for name in more] == [True, True, False, True]
+    assert (results["a"]["seed"], results["a"]["first_seed"]) == (3, first_seed(3, 5))
+    assert results["a"]["checkpoint"] == str(tmp_path / "run" / "checkpoints" / "best.safetensors")
+
+
+@pytest.mark.usefixtures("point_mass")
+def test_a_film_comes_before_the_evaluation_that_was_asked_for_with_it(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(run, "film", lambda path, config, film, seed: print("film", film.name, seed, file=sys.stderr))
+    words = "--eval-only --zero-correction --env DoraCube-v1 --seed 1 --episodes 3 --workers 1 --video"
+    assert call(script, monkeypatch, *words.split(), "--out", str(tmp_path / "zero")) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == f"film zero.mp4 {first_seed(1, 3)}"
+    assert lines[1:3] == ["evaluation on 3 episodes ...", lines[2]]
+    assert lines[2].startswith("without any correction: success ")
+
+
+def test_zero_correction_of_a_task_is_evaluated_without_any_policy(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    words = "--eval-only --zero-correction --env DoraCube-v1 --preset none --episodes 2 --workers 1"
+    assert call(script, monkeypatch, *words.split(), "--out", str(tmp_path / "zero")) == 0
+    result = json.loads((tmp_path / "zero" / "result.json").read_text())
+    assert (result["agent"], result["success_rate"], result["zero_success_rate"]) == ("zero", 1.0, 1.0)
+    assert (result["env_steps"], result["steps_to_50"], result["eval_episodes"]) == (0, None, 2)
+
+
+def test_the_reward_of_the_paper_trains(script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    words = (
+        "--env DoraCube-v1 --reward paper --total-steps 128 --num-envs 8 --workers 0 --episodes 2 --eval-envs 2 "
+        "--no-zero-correction --learner.rollout 16 --learner.minibatch 64"
+    )
+    assert call(script, monkeypatch, *words.split(), "--out", str(tmp_path / "run")) == 0
+    config = RunFolder(tmp_path / "run").read_config()
+    assert (config.reward, config.task_options["reward_mode"]) == ("paper", "paper")
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["reward"] == "paper"
+    header = (tmp_path / "run" / "eval.csv").read_text().splitlines()[0].split(",")
+    assert [name.removeprefix("reward/") for name in header if name.startswith("reward/")] == [
+        *paper_terms(CubeConfig()).terms
+    ]
+
+
+def test_settings_without_a_reward_mean_the_dense_one_and_keep_their_digest():
+    config = run.parse(["--env", "DoraCube-v1"]).run
+    content = plain(config)
+    assert content.pop("reward") == "dense"
+    assert config_from_dict(content) == config
+    del content["total_steps"]
+    assert config.digest() == digest_of(content)[:12]
+    assert config.digest() != run.parse(["--env", "DoraCube-v1", "--reward", "paper"]).run.digest()

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from fake_task import PointMass
@@ -24,6 +25,7 @@ from dora.agents.evaluation.play import evaluate_checkpoint, record
 from dora.agents.learners.networks import last_layer
 from dora.agents.learners.ppo import PPO
 from dora.agents.runs.logging import TAGS, tags_table
+from dora.agents.runs.progress_table import read_progress
 from dora.agents.runs.run_folder import RunFolder
 from dora.agents.runs.trainer import Trainer
 from dora.errors import InputError
@@ -259,6 +261,9 @@ def test_kill_then_resume_then_ctrl_c(tmp_path: Path):
     result = json.loads((folder.path / "result.json").read_text())
     assert not result["finished"]
     assert result["env_steps"] > killed
+    steps = read_progress(folder.progress)["env_steps"]
+    assert (np.diff(steps) == np.diff(steps)[0]).all()  # none is missing and none is there twice
+    assert steps[-1] == result["env_steps"]
     assert list(result)[: len(RESULT_KEYS)] == RESULT_KEYS
     assert session_empties(process.pid)
 

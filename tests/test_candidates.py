@@ -13,6 +13,7 @@ from dora.robot import RobotDescription, load_robot
 
 COUNT = 6
 CONTACTS = 4
+POINTS = 50
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +38,7 @@ def candidates(robot: RobotDescription, cube: AffordanceObject) -> GraspCandidat
         pregrasp=random(COUNT, 20), grasp=random(COUNT, 20), grasp_class=("BodyGrasp", "RimGrasp") * (COUNT // 2),
         joints=random(COUNT, 20), contacts=random(COUNT, CONTACTS, 3),
         contact_finger=torch.arange(COUNT * CONTACTS).reshape(COUNT, CONTACTS) % 7,
+        contact_map=((random(COUNT, POINTS) < 0.2) * (7 * random(COUNT, POINTS)).int()).byte(),
         energy={"closure": random(COUNT), "distance": random(COUNT)}, penetration=random(COUNT) / 1000,
         self_penetration=random(COUNT) / 1000, valid=torch.arange(COUNT) < 4, score=random(COUNT),
         digest=cube.digest, robot=robot.name, robot_digest=hand_digest(robot), settings='{"seed": 3}',
@@ -66,11 +68,13 @@ def test_fields_left_out_say_so(candidates: GraspCandidates, tmp_path: Path):
     assert torch.equal(plain.joints, plain.grasp)
     assert plain.contacts.shape == (COUNT, 0, 3)
     assert plain.contact_finger.shape == (COUNT, 0)
+    assert plain.contact_map.shape == (COUNT, 0)
     assert plain.valid.all()
     assert plain.score.isnan().all()
     assert plain.penetration.isnan().all()
     assert plain.energy == {}
     plain.save(tmp_path / "plain.safetensors")
+    assert b"map" not in (tmp_path / "plain.safetensors").read_bytes()  # the file is what it was before there were maps
     assert_same(GraspCandidates.load(tmp_path / "plain.safetensors"), plain)
 
 

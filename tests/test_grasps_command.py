@@ -1,6 +1,7 @@
 """The grasp command: bad input, what it writes, interruption, and a mesh that nobody here made."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -13,9 +14,12 @@ from commands import call, load_command
 
 from dora.affordance.bundled_sets import bundled_path
 from dora.affordance.candidates import GraspCandidates
+from dora.affordance.contact_maps import with_contact_maps
 from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.objects.catalogue import load_object
+from dora.affordance.search.cache import hand_of, map_of
 from dora.affordance.search.optimise import Settings
+from dora.affordance.views import album
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.sim.grasp_tests import generation as grasps
@@ -51,6 +55,8 @@ def script() -> ModuleType:
         ("--mesh nowhere.stl", "nowhere.stl"),
         ("--object hamer", "no object 'hamer'; did you mean hammer? choose one of: cube, hammer, jug, microwave"),
         ("--make-bundle", "need --object"),
+        ("--contact-maps", "need --object"),
+        ("--contact-maps --object spoon", "no object 'spoon'"),
         ("--rank-in-task --mesh a.stl", "need --object"),
         ("--make-bundle --object cube --kinematics pytorch_kinematics", "is for searches, not for --make-bundle"),
         ("--rank-in-task --object spoon", "no object 'spoon'"),
@@ -93,6 +99,9 @@ def test_files_and_table(
     assert "unseated one iteration" in shown
     report = json.loads(out.with_suffix(".json").read_text())
     candidates = GraspCandidates.load(out, load_object("jug"), load_robot("diana7_hit"))
+    anew = with_contact_maps(candidates, map_of(load_object("jug"), "cpu"), hand_of(load_robot("diana7_hit"), "cpu"))
+    assert torch.equal(candidates.contact_map, anew.contact_map)
+    assert candidates.contact_map.any()
     assert set(report) >= KEYS
     assert set(report["penetration_mm"]) >= {"median", "p95", "max"}
     assert report["requested"] == 6
@@ -106,6 +115,23 @@ def test_files_and_table(
     names = ("no_closure", "unseated", "unseated_no_closure", "unseated_one_iteration")
     assert {name: b["requested"] for name, b in report["baselines"].items()} == dict.fromkeys(names, 3)
     assert sorted(p.name for p in out.parent.iterdir()) == ["jug.json", "jug.safetensors"]
+
+
+def test_contact_maps_of_a_folder(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    """A copy of the jug whose grasps have lost their maps gets them back, and all else stays."""
+    folder = tmp_path / "jug"
+    shutil.copytree(bundled_path("jug").parent, folder)
+    bundled = GraspCandidates.load(bundled_path("jug"))
+    replace(bundled, contact_map=torch.zeros(len(bundled), 0, dtype=torch.uint8)).save(folder / "grasps.safetensors")
+    assert call(script, monkeypatch, "--object", str(folder), "--contact-maps") == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[1].startswith("handle 96: contact maps vote ")
+    assert shown[-1] == str(folder / "grasps.safetensors")
+    again = GraspCandidates.load(folder / "grasps.safetensors")
+    assert (again.contact_map == bundled.contact_map).float().mean() > 0.9999
+    assert torch.equal(again.grasp, bundled.grasp)
 
 
 def test_interruption_leaves_nothing(
@@ -205,6 +231,10 @@ def test_searches_by_region_and_the_votes(
         assert closed["confusion"] == [[each, 0, 0, 0], [0, each, 0, 0], [0, 0, 0, 0]]
         assert before["balanced_accuracy"] == pytest.approx(0.5)  # the bundled ones touch the handle
         assert before["recall"] == {"body": 0, "handle": 1}
+        mapped = voting[group]["contact_map"]["confusion"]
+        assert [sum(row) for row in mapped] == [each, each, 0]
+        assert min(mapped[0][1], mapped[1][1]) > each / 2  # so do most of their maps
+    assert voting["map_by_closed_hand"] == voting["all"]["contact_map"]["confusion"]
 
 
 def test_the_digest_follows_object_robot_and_settings():
@@ -233,6 +263,7 @@ def test_labelled_meshes_by_others_go_all_the_way(
     """Import, regions, search by region, simulation, files, and pictures of them, in a short search."""
     monkeypatch.setenv("DORA_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(grasps, "Settings", lambda: QUICK)
+    monkeypatch.setattr(album, "FINER", 1.0)
     options, shape = FOREIGN[name]
     labels, out = tmp_path / "labels.yaml", tmp_path / "found.safetensors"
     labels.write_text(json.dumps({"regions": {"grip": shape}}))

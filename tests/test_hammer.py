@@ -1,8 +1,10 @@
 """DoraHammer-v1: ballistics and striking geometry on invented states, the nail, and what the scripted solution does."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from math import pi
 
+import numpy as np
 import pytest
 import sapien
 import torch
@@ -268,6 +270,72 @@ def test_slow_impacts_and_no_contact_leave_it_alone(bench: tasks.DoraEnv):
     assert driven == 0.0
     bench.reset(seed=1)
     assert run(bench, 8) == (0.0, 0.0)
+
+
+@contextmanager
+def pressed(task: tasks.DoraEnv, force: float) -> Iterator[None]:
+    """The nail is pressed down by a force from elsewhere [N], whatever the hammer does."""
+    settings, nail = CONFIG.nail, task.task.nail
+    nail._bodies[0].set_qf(np.array([force - settings.resistance], np.float32))
+    yield
+    nail._bodies[0].set_qf(np.array([-settings.resistance], np.float32))
+
+
+def beside_nail(task: tasks.DoraEnv, shift: tuple[float, float, float], turn: float) -> None:
+    """The hammer comes down at 1.6 m/s, its face `shift` [m] away from the nail, turned about world y [rad]."""
+    body = over_nail(task, 0.01, 1.6)
+    p, q = torch.tensor(body.entity_pose.p), torch.tensor(body.entity_pose.q)
+    tilt = quaternion_from_rotation_vector(torch.tensor([[0.0, turn, 0.0]]))
+    task.target_object.set_pose(Pose.create_from_pq((p + torch.tensor(shift))[None], quaternion_multiply(tilt, q[None])))
+    task.target_object.set_linear_velocity(torch.tensor([[0.0, 0.0, -1.6]]))
+
+
+def test_a_force_from_elsewhere_while_the_hammer_falls_beside_the_nail_is_no_blow(bench: tasks.DoraEnv):
+    beside_nail(bench, (0.0, 0.06, 0.02), 0.0)
+    with pressed(bench, 30.0):
+        depth, driven = run(bench, 6)
+    assert depth > 5
+    assert driven == 0.0
+
+
+def test_a_blow_with_the_handle_is_no_blow(bench: tasks.DoraEnv):
+    """The hammer lies across the nail and falls flat on it, the middle of its handle first."""
+    over_nail(bench, 0.01, 0.0)
+    top = torch.tensor(CONFIG.nail.top)
+    flat = quaternion_from_rotation_vector(torch.tensor([[0.0, pi / 2, 0.0]]))  # the handle along x
+    middle = quaternion_apply(flat, (bench.task.points["butt"] + bench.task.points["neck"]) / 2)
+    place = top + torch.tensor([0.0, 0.0, 0.03])
+    bench.target_object.set_pose(Pose.create_from_pq(place[None] - middle, flat))
+    bench.target_object.set_linear_velocity(torch.tensor([[0.0, 0.0, -1.6]]))
+    depth, driven = run(bench, 6)
+    assert depth > 0.5
+    assert driven == 0.0
+
+
+def test_a_blow_with_something_else_is_no_blow(bench: tasks.DoraEnv):
+    """A block of 0.6 kg, as heavy as a palm, hits the nail while the hammer falls beside it."""
+    beside_nail(bench, (0.0, 0.10, 0.0), 0.0)
+    builder = bench.scene.sub_scenes[0].create_actor_builder()
+    builder.add_box_collision(half_size=(0.03, 0.03, 0.03), density=0.6 / 0.06**3)
+    builder.initial_pose = sapien.Pose([*CONFIG.nail.top[:2], CONFIG.nail.top[2] + 0.04])
+    block = builder.build("block")
+    block.find_component_by_type(sapien.physx.PhysxRigidDynamicComponent).set_linear_velocity([0.0, 0.0, -1.6])
+    depth, driven = run(bench, 6)
+    block.remove_from_scene()
+    assert depth > 2
+    assert driven == 0.0
+
+
+def test_what_sinks_after_a_blow_counts_only_while_nothing_else_presses(bench: tasks.DoraEnv):
+    driven = []
+    for touched in (False, True):
+        over_nail(bench, 0.01, 1.6)
+        nail, pressed_by = bench.task.nail, bench.task.nail._pressed
+        nail._pressed = (lambda i, c, by=pressed_by: (by(i, c)[0], True)) if touched else pressed_by
+        driven.append(run(bench, 4)[1])
+        del nail._pressed
+    assert driven[0] > 2
+    assert driven[1] == 0.0
 
 
 def test_the_nail_never_comes_back_up_and_a_restored_one_stays_where_it_was(bench: tasks.DoraEnv):

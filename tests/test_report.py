@@ -1,13 +1,17 @@
 """Reports are made from result files, and say so when there are none."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
 from urllib.parse import unquote
 
+import imageio.v2 as imageio
 import pytest
 
-from dora.agents.runs.report import find_runs, tables, write_report
+from dora.agents.runs.progress_table import ProgressTable
+from dora.agents.runs.report import pooled, tables, write_report
+from dora.agents.runs.run_results import find_runs, zero_shares
 from dora.errors import InputError
 
 
@@ -19,6 +23,7 @@ def write_run(
     finished: bool = True,
     steps: int = 1000,
     env: str = "Toy-v1",
+    episodes: int | None = None,
     **task: object,
 ) -> None:
     folder.mkdir(parents=True)
@@ -27,6 +32,7 @@ def write_run(
         "success_rate": success, "zero_success_rate": 0.5 if guidance == "affordance" else None,
         "penetration_p95_mm": 2.0, "finished": finished, "task": task,
     }  # fmt: skip
+    result |= {} if episodes is None else {"eval_episodes": episodes}
     (folder / "result.json").write_text(json.dumps(result))
     head = "env_steps,wall_seconds,success_rate,return_mean,penetration_p95_mm,training_success_rate"
     (folder / "curve.csv").write_text(f"{head}\n500,45,0.1,3,2,0.1\n1000,90,{success},9,2,0.4\n")
@@ -42,12 +48,49 @@ def test_seeds_of_a_group_make_one_row(tmp_path: Path):
     write_run(tmp_path / "g", 0, 0.7, steps=10_000)
     rows = tables(find_runs(tmp_path)).splitlines()[2:]
     assert rows[0].startswith("| Toy-v1 | hard | PPO | affordance | 1 | **40.0** |")
-    assert rows[1].startswith("| Toy-v1 | standard | PPO | affordance | 2 | **95.0 ± 7.1** | 50.0 ± 0.0 |")
+    assert rows[1].startswith("| Toy-v1 | standard | PPO | affordance | 2 | **95.0** | 90.0, 100.0 | 50.0 |")
     assert rows[2].startswith("| Toy-v1 | standard | PPO | affordance | 1 | **70.0** |")
     assert "| 10k |" in rows[2]
     assert rows[3].startswith("| Toy-v1 | standard | PPO | affordance (observation, filter, prior) | 1 | **30.0** |")
-    assert rows[4].startswith("| Toy-v1 | standard | PPO | none | 1 | **20.0** | - |")
+    assert rows[4].startswith("| Toy-v1 | standard | PPO | none | 1 | **20.0** | 20.0 | - |")
     assert len(rows) == 5
+
+
+def test_success_has_the_interval_of_all_episodes_and_zero_correction_that_of_each_start_once(tmp_path: Path):
+    write_run(tmp_path / "a", 0, 0.9, episodes=200)
+    write_run(tmp_path / "b", 1, 1.0, episodes=200)
+    write_run(tmp_path / "c", 0, 0.0, "none", episodes=100)
+    runs = find_runs(tmp_path)
+    rows = tables(runs).splitlines()[2:]
+    assert "| 2 | **95.0 [92.4, 96.7]** | 90.0, 100.0 | 50.0 [43.1, 56.9] | 2.0 ± 0.0 |" in rows[0]
+    assert "| 1 | **0.0 [0.0, 3.7]** | 0.0 | - |" in rows[1]
+    again = dataclasses.replace(
+        runs[0], result=runs[0].result | {"first_seed": 1_500_010_000, "zero_success_rate": 0.6}
+    )
+    assert zero_shares([*runs, again]) == [(0.5, 200), (0.6, 200)]
+    assert pooled(zero_shares([*runs, again])) == "55.0 [50.1, 59.8]"
+
+
+def test_runs_of_another_reward_and_policies_evaluated_again_have_rows_of_their_own(tmp_path: Path):
+    write_run(tmp_path / "a", 0, 0.9)
+    for name, more in (("b", {"reward": "paper"}), ("c", {"checkpoint": "best.safetensors"})):
+        write_run(tmp_path / name, 0, 0.9)
+        path = tmp_path / name / "result.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | more))
+    agents = [row.split(" | ")[2] for row in tables(find_runs(tmp_path)).splitlines()[2:]]
+    assert agents == ["PPO", "PPO, evaluated again", "PPO, paper's reward"]
+
+
+def test_training_is_drawn_where_runs_have_a_table_of_it(tmp_path: Path):
+    for seed, name in enumerate("ab"):
+        write_run(tmp_path / "runs" / name, seed, 0.9)
+    figure = write_report(tmp_path / "runs", tmp_path / "without")[-1]
+    table = ProgressTable(tmp_path / "runs" / "a" / "progress.csv", ["reach"])
+    for step in range(10, 1010, 10):
+        table.add({"env_steps": step, "episodes": step % 3, "success_rate": step / 1000 if step % 3 else float("nan")})
+    drawn = write_report(tmp_path / "runs", tmp_path / "with")[-1]
+    heights = [imageio.imread(path).shape[0] for path in (figure, drawn)]
+    assert heights[1] > 1.5 * heights[0]
 
 
 def test_a_report_has_a_table_a_page_and_a_figure(tmp_path: Path):

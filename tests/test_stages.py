@@ -4,9 +4,12 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from invented import invented, memory
 from torch import Tensor
 
+from dora.tasks.mdp.mdp import Mdp
 from dora.tasks.mdp.rewards import Term, Terms, tolerance
+from dora.tasks.mdp.snapshot import Snapshot
 from dora.tasks.mdp.stages import Stage, StageMachine
 
 
@@ -161,3 +164,18 @@ def test_bad_tables_are_refused():
         Terms({})
     with pytest.raises(ValueError, match="penalty"):
         Terms({"a": Term(value, 1.0, "penalty")})
+
+
+def test_an_episode_is_judged_with_and_without_overlap_and_at_its_end():
+    """Rows: not finished, finished, with overlap, dropped at the end, failed, unreachable."""
+    stage = Stage[Snapshot]("lift", lambda s: s.object.p[:, 2], lambda s: s.object.p[:, 2] > 0.1)
+    terms = Terms({"height": Term[Snapshot](lambda s: s.object.p[:, 2], 1.0)})
+    lost = torch.arange(6) == 4
+    mdp = Mdp[Snapshot]([stage], terms, terms, 0.003, failed=lambda s, memory: lost)
+    heights = torch.tensor([0.2, 0.2, 0.2, 0.0, 0.2, 0.2])
+    state = invented(6, object_p=torch.stack([0 * heights, 0 * heights, heights], 1))
+    overlap = memory(6, max_penetration=torch.tensor([0.0, 0.003, 0.004, 0.0, 0.0, 0.0]))
+    verdict = mdp.verdict(torch.arange(6) > 0, torch.arange(6) == 5, state, overlap)
+    assert {name: value.nonzero()[:, 0].tolist() for name, value in verdict.items()} == {
+        "success": [1, 3], "raw_success": [1, 2, 3], "success_at_end": [1], "fail": [4, 5],
+    }  # fmt: skip

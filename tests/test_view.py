@@ -28,9 +28,10 @@ from dora.affordance.objects.palette import PALETTE
 from dora.affordance.views import album, pictures
 from dora.affordance.views import page as viewing
 from dora.affordance.views.album import chosen
-from dora.affordance.views.page import CONTACTS, VALID, Filter, GraspPage, Surface, describe
+from dora.affordance.views.page import CONTACTS, VALID, Filter, GraspPage, describe
 from dora.affordance.views.pictures import PARTS, TILE, best_view
 from dora.affordance.views.rasteriser import Camera, seen
+from dora.affordance.views.surface import EDGE, Surface
 from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import load_robot
@@ -86,24 +87,60 @@ def test_description(candidates: GraspCandidates):
     assert "not valid" in text
     assert "succeeded in 82 %" in text
     assert "closure: 2" in text
+    points = torch.bincount(candidates.contact_map[2].long())
+    assert f"contact map: palm {points[1]}, " in text
+    none = replace(candidates, contact_map=torch.zeros(COUNT, 0, dtype=torch.uint8))
+    assert "contact map: none" in describe(none, 2)
+
+
+def test_the_page_makes_maps_that_candidates_lack(page: GraspPage, candidates: GraspCandidates):
+    """As `page`, but of a file without maps; the text has what the map votes for."""
+    plain = replace(candidates, contact_map=torch.zeros(COUNT, 0, dtype=torch.uint8))
+    other = GraspPage(load_object("cube"), plain, load_robot("diana7_hit"), free_port())
+    try:
+        assert other.candidates is not None
+        assert torch.equal(other.candidates.contact_map, candidates.contact_map)
+        assert other.text.content.endswith("the map votes for body")
+    finally:
+        other.server.stop()
 
 
 def test_surface_colours(candidates: GraspCandidates):
     obj = load_object("jug")
     surface = Surface(obj)
     edges = surface.mesh.edges_unique_length
-    assert edges.max() <= viewing.EDGE
+    assert edges.max() <= EDGE
     colours = surface.regions()
     for index, label in enumerate(obj.labels):
         here = (colours[:, :3] == PALETTE[index]).all(1)
         area = surface.mesh.area_faces[here].sum()
         assert area == pytest.approx(obj.region(label).area, rel=1e-6)
-    hand = HandModel(load_robot("diana7_hit"))
     cube = Surface(load_object("cube"))
-    painted = cube.contacts(candidates, 0, hand)[:, :3]
-    touching = {f for f in candidates.contact_finger[0].tolist() if f > 0}
+    painted = cube.contacts(candidates.contact_map[0])[:, :3]
+    touching = candidates.contact_map[0].unique().tolist()
     seen = {tuple(row) for row in np.unique(painted, axis=0)}
-    assert {tuple(PARTS[list(PARTS)[f]]) for f in touching} <= seen
+    assert {tuple(PARTS[list(PARTS)[f]]) for f in touching} == seen
+
+
+def test_faces_show_the_points_of_the_map_on_their_side_of_a_wall():
+    """The outside of the jug's body touched all over, its inside nowhere; and one point alone."""
+    surface = Surface(load_object("jug"))
+    axis = surface.map.points[surface.map.labels == 0].mean(0)
+    middle = (surface.map.points[:, 2] - axis[2]).abs() < 0.03
+    away = (surface.map.normals[:, :2] * (surface.map.points - axis)[:, :2]).sum(1)
+    outside = middle & (away > 0) & (surface.map.labels == 0)
+    shown = surface.parts((4 * outside).byte())
+    centres, normals = surface.mesh.triangles_center - axis.numpy(), surface.mesh.face_normals
+    inner = (surface.labels == 0) & (np.abs(centres[:, 2]) < 0.02) & ((normals * centres)[:, :2].sum(1) < 0)
+    outer = (surface.labels == 0) & (np.abs(centres[:, 2]) < 0.02) & ((normals * centres)[:, :2].sum(1) > 0)
+    assert (shown[inner] == 0).mean() > 0.97
+    assert (shown[outer] == 4).mean() > 0.97
+    alone = torch.zeros(len(surface.map), dtype=torch.uint8)
+    alone[100] = 6
+    (spot,) = np.nonzero(surface.parts(alone))
+    assert len(spot)
+    distance = np.linalg.norm(surface.mesh.triangles_center[spot] - surface.map.points[100].numpy(), axis=1)
+    assert distance.max() < 2 * surface.map.spacing
 
 
 def test_the_hand_is_where_the_model_says(candidates: GraspCandidates):
@@ -131,7 +168,7 @@ def test_widgets_change_the_scene(page: GraspPage, candidates: GraspCandidates):
     until(lambda: palms.batched_scales.sum() == 3)
     np.testing.assert_allclose(palms.batched_positions[:3], candidates.position[[4, 6, 7]], atol=1e-6)
     page.colouring.value = CONTACTS
-    until(lambda: page._painted == page.surface.contacts(candidates, 4, page.model).tobytes())
+    until(lambda: page._painted == page.surface.contacts(candidates.contact_map[4]).tobytes())
     for box in page.classes.values():
         box.value = False
     until(lambda: page.text.content == "No grasp passes the filter.")
@@ -226,7 +263,7 @@ def test_pictures_instead_of_the_page(
     """Four grasps: every class is among them, and each part of the hand that touches has its colour."""
     monkeypatch.setattr(pictures, "TILE", SMALL)
     monkeypatch.setattr(pictures, "AZIMUTHS", 3)
-    monkeypatch.setattr(album, "EDGE", viewing.EDGE)
+    monkeypatch.setattr(album, "FINER", 1.0)
     folder = tmp_path / "new" / "pictures"
     assert call(script, monkeypatch, "jug", "--pictures", str(folder)) == 0
     paths = [folder / f"jug-{what}.png" for what in ("map", "grasps", "contacts")]
@@ -296,15 +333,17 @@ def test_maps_and_titles_are_those_of_the_chosen_grasps(
     candidates: GraspCandidates, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     seen = {}
-    several = replace(candidates, valid=torch.arange(COUNT) > 4)
-    monkeypatch.setattr(album, "EDGE", 0.01)
+    several = replace(candidates, valid=torch.arange(COUNT) > 4, contact_map=candidates.contact_map.clone())
+    monkeypatch.setattr(album, "FINER", 0.5)
     monkeypatch.setattr(album, "picture_grasps", lambda shown, *_: seen.update(shown=shown))
     monkeypatch.setattr(album, "picture_contacts", lambda mesh, maps, titles, *_: seen.update(maps=maps, titles=titles))
     robot, cube = load_robot("diana7_hit"), load_object("cube")
+    several.contact_map[chosen(several)[3]] = 0
     album.write_album(cube, several, robot, tmp_path)
     rows = chosen(several)
     assert torch.equal(seen["shown"].position, several.position[rows])
-    assert seen["titles"] == [pictures.caption(several, row) for row in rows]
-    surface, hand = Surface(cube, 0.01), HandModel(robot)
+    votes = [f"the other side; the map votes for {held}" for held in ("body", "body", "body", "nothing")]
+    assert seen["titles"] == [(pictures.caption(several, row), vote) for row, vote in zip(rows, votes, strict=True)]
+    surface = Surface(cube, 0.5)
     for found, row in zip(seen["maps"], rows, strict=True):
-        np.testing.assert_array_equal(found, surface.parts(several, row, hand))
+        np.testing.assert_array_equal(found, surface.parts(several.contact_map[row]))

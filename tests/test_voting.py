@@ -18,7 +18,7 @@ from dora.affordance.maps.contact_semantic_map import (
     pressed_contacts,
     wrist_matrix,
 )
-from dora.affordance.maps.voting import NO_CONTACT, VotingSettings, vote
+from dora.affordance.maps.voting import HAND_PARTS, NO_CONTACT, VotingSettings, vote, vote_over_map
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.objects.signed_distance import SignedDistanceField
 from dora.errors import InputError
@@ -105,6 +105,46 @@ def test_ties_and_empty_contacts(where, finger, expected):
     assert vote(line, contacts, torch.tensor([finger]), VotingSettings(neighbours=2)).item() == expected
 
 
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        ([0, 0, 0, 0, 0, 0], NO_CONTACT),  # nothing touches
+        ([3, 0, 0, 0, 0, 0], 0),  # one finger on a
+        ([3, 0, 0, 0, 0, 2], 2),  # index on a, thumb on c: the thumb weighs more
+        ([3, 4, 0, 0, 0, 2], 0),  # 2 : 2, and more neighbours are a
+        ([3, 0, 4, 0, 0, 0], 0),  # 1 : 1, as many neighbours each: first name
+        ([3, 0, 4, 4, 0, 0], 1),  # 1 : 1, and more neighbours are b
+        ([2, 2, 2, 0, 3, 3], 0),  # mode within the thumb, which weighs more than the index
+        ([3, 3, 4, 5, 6, 6], 1),  # middle and ring on b, one finger each on a and c
+        ([1, 1, 0, 0, 4, 4], 0),  # palm and finger weigh the same, as many neighbours each: first name
+        ([6, 0, 5, 0, 4, 2], 2),  # thumb and middle outweigh the other fingers
+    ],
+)
+def test_the_printed_vote_takes_every_point_of_the_map_that_is_touched(parts, expected):
+    """On a line of points a a b b c c, whose two nearest neighbours are themselves and one of their own label."""
+    line = box_map([0, 0, 1, 1, 2, 2])
+    line.points[:, 0] = torch.tensor([0.0, 0.01, 0.03, 0.04, 0.06, 0.07])
+    found = vote_over_map(line, torch.tensor([parts], dtype=torch.uint8), VotingSettings(neighbours=2))
+    assert found.item() == expected
+
+
+@given(st.integers(0, 10_000), st.integers(1, 9))
+@settings(max_examples=20, deadline=None)
+def test_the_printed_vote_is_the_vote_of_the_touched_points(jug, seed, neighbours):
+    generator = torch.Generator().manual_seed(seed)
+    maps = torch.randint(1, HAND_PARTS + 1, (4, len(jug)), generator=generator)
+    maps *= torch.rand(4, len(jug), generator=generator) < 0.004
+    chosen = VotingSettings(neighbours=neighbours)
+    points = jug.points.expand(4, -1, -1)
+    assert vote_over_map(jug, maps.byte(), chosen).tolist() == vote(jug, points, maps, chosen).tolist()
+
+
+def test_the_printed_vote_needs_the_points_of_the_map(jug):
+    with pytest.raises(InputError, match="the contact maps have 7 points and the affordance map of jug 4096"):
+        vote_over_map(jug, torch.zeros(2, 7, dtype=torch.uint8))
+    assert vote_over_map(jug, torch.zeros(2, len(jug), dtype=torch.uint8)).tolist() == [NO_CONTACT] * 2
+
+
 def test_points_without_contact_are_not_looked_at(jug):
     contacts = torch.full((2, 3, 3), torch.nan)
     contacts[0, 0] = jug.points[0]
@@ -147,6 +187,24 @@ def test_contact_semantic_map_names_the_part_that_touches():
     found = contact_semantic_map(points, position, quaternion, joints, hand)
     assert (found[0] == hand.contact_part).float().mean() > 0.97
     assert (contact_semantic_map(points + 0.5, position, quaternion, joints, hand) == 0).all()
+
+
+def test_contact_semantic_map_is_the_nearest_of_all_capsules():
+    """Compared with the distance to every capsule, for points everywhere around three hands."""
+    robot, generator = load_robot("diana7_hit"), torch.Generator().manual_seed(0)
+    hand = HandModel(robot, dtype=torch.float64)
+    joints = torch.tensor(robot.postures["home"].hand).double().repeat(3, 1) + torch.tensor([[0.0], [0.1], [0.2]])
+    position = 0.02 * torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    quaternion = torch.nn.functional.normalize(torch.randn(3, 4, generator=generator, dtype=torch.float64), dim=-1)
+    points = 0.12 * torch.randn(4000, 3, generator=generator, dtype=torch.float64)
+    ends = hand.place(hand.forward(wrist_matrix(position, quaternion), robot.reduce_hand(joints)), hand.ends)
+    start, axis = ends[:, 0::2], ends[:, 1::2] - ends[:, 0::2]
+    away = points[None, :, None] - start[:, None]
+    share = ((away * axis[:, None]).sum(-1) / axis.square().sum(-1)[:, None].clamp_min(1e-30)).clamp(0, 1)
+    gap, nearest = ((away - share[..., None] * axis[:, None]).norm(dim=-1) - hand.radius).min(-1)
+    expected = torch.where(gap < 0.005, hand.part[hand.ends.body[0::2]][nearest], 0)
+    assert len(expected.unique()) == 7
+    assert torch.equal(contact_semantic_map(points, position, quaternion, joints, hand), expected)
 
 
 def test_hand_contacts_lie_on_the_object():

@@ -6,12 +6,15 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from dora.affordance.maps.packed_maps import COUNT, PART, POINT, pack, unpack
+from dora.affordance.maps.voting import HAND_PARTS
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.digests import digest_of
 from dora.errors import InputError
@@ -20,6 +23,8 @@ from dora.robot import RobotDescription
 
 FORMAT = "dora-grasps 1"
 """Format and version of a file of candidates."""
+MAP_POINTS = "map_points"
+"""Entry of a file's metadata with the number of points of its contact maps; files without maps have none."""
 UNKNOWN = torch.empty(0)
 """Marks a tensor field that is not given; replaced by its default in `__post_init__`."""
 DIGITS = 9
@@ -41,6 +46,8 @@ class GraspCandidates:
         joints: (c, 20) hand joints at contact [rad]; `grasp` if not given.
         contacts: (c, k, 3) contact points of the closed hand on the object [m]; k = 0 if not given.
         contact_finger: (c, k) contact class of each: 0 no contact, 1 palm, 2 thumb, ... 6 pinky.
+        contact_map: (c, p) contact semantic map of the hand at `joints`: contact class of each of the p points of the
+            object's affordance map (`AffordanceMap.from_object`); p = 0 if not given.
         energy: (c,) unweighted value per name of an energy term.
         penetration: (c,) penetration depth of hand and object at `joints` [m]; nan = not measured.
         self_penetration: (c,) penetration depth between links of the hand at `joints` [m]; nan = not measured.
@@ -52,7 +59,8 @@ class GraspCandidates:
         settings: settings of search, grasp test and ranking, as text.
 
     Raises:
-        InputError: no candidate, fields of different lengths, or a pose or joint that is not finite.
+        InputError: no candidate, fields of different lengths, a pose or joint that is not finite, or a contact map with
+            a class that is not 0 to 6.
     """
 
     object: str
@@ -65,6 +73,7 @@ class GraspCandidates:
     joints: Float[Tensor, "c 20"] = UNKNOWN
     contacts: Float[Tensor, "c k 3"] = UNKNOWN
     contact_finger: Int[Tensor, "c k"] = UNKNOWN
+    contact_map: UInt8[Tensor, "c p"] = UNKNOWN
     energy: dict[str, Float[Tensor, " c"]] = field(default_factory=dict)
     penetration: Float[Tensor, " c"] = UNKNOWN
     self_penetration: Float[Tensor, " c"] = UNKNOWN
@@ -85,6 +94,7 @@ class GraspCandidates:
             "joints": self.grasp,
             "contacts": torch.zeros(count, 0, 3, device=device),
             "contact_finger": torch.zeros(count, 0, dtype=torch.long, device=device),
+            "contact_map": torch.zeros(count, 0, dtype=torch.uint8, device=device),
             "penetration": missing,
             "self_penetration": missing,
             "valid": torch.ones(count, dtype=torch.bool, device=device),
@@ -98,6 +108,8 @@ class GraspCandidates:
                 raise InputError(f"candidates of {self.object!r}: {name} has {len(value)} rows, not {count}")
             if name in FINITE and not torch.isfinite(value).all():
                 raise InputError(f"candidates of {self.object!r}: {name} holds a value that is not finite")
+        if bool((self.contact_map > HAND_PARTS).any()):
+            raise InputError(f"candidates of {self.object!r}: contact_map holds a class that is not 0 to {HAND_PARTS}")
 
     def __len__(self) -> int:
         return len(self.grasp_class)
@@ -137,15 +149,19 @@ class GraspCandidates:
         return dict(Counter(self.grasp_class).most_common())
 
     def save(self, path: Path | str) -> None:
-        """Write a safetensors file, atomically.
+        """Write a safetensors file, atomically; of contact maps, only the points that are touched.
 
         Raises:
             InputError: it cannot be written.
         """
         names = sorted(set(self.grasp_class))
         index = torch.tensor([names.index(name) for name in self.grasp_class])
-        metadata = {name: getattr(self, name) for name in TEXTS} | {"classes": names}
-        write_tensors(Path(path), FORMAT, self.tensors() | {"grasp_class": index}, metadata)
+        metadata: dict[str, Any] = {name: getattr(self, name) for name in TEXTS} | {"classes": names}
+        tensors = self.tensors() | {"grasp_class": index}
+        maps = tensors.pop("contact_map")
+        if points := maps.shape[1]:
+            tensors, metadata = tensors | pack(maps), metadata | {MAP_POINTS: points}
+        write_tensors(Path(path), FORMAT, tensors, metadata)
 
     @classmethod
     def load(
@@ -160,6 +176,9 @@ class GraspCandidates:
         tensors, metadata = read_tensors(path, FORMAT)
         classes = metadata.pop("classes")
         names = tuple(classes[i] for i in tensors.pop("grasp_class").tolist())
+        points = metadata.pop(MAP_POINTS, 0)
+        if points or {COUNT, POINT, PART} & set(tensors):
+            tensors["contact_map"] = unpack(tensors, len(names), points, str(path))
         own, energy = _split_energy(tensors)
         candidates = cls(grasp_class=names, energy=energy, **own, **metadata)
         candidates.check_fits(path, object, robot)
@@ -207,10 +226,11 @@ def _split_energy(tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[s
 def concatenate(sets: Sequence[GraspCandidates]) -> GraspCandidates:
     """All candidates of several sets of one object and one robot; settings are those of the first.
 
-    Sets with fewer contacts per candidate are padded with contact class 0; energies that a set lacks are nan.
+    Sets with fewer contacts per candidate are padded with contact class 0; energies that a set lacks are nan. Contact
+    maps are left out unless all sets have them.
 
     Raises:
-        InputError: no set, or sets of different objects, robots or digests.
+        InputError: no set, or sets of different objects, robots, digests or numbers of points of their contact maps.
     """
     if not sets:
         raise InputError("there is no set of candidates to join; give at least one")
@@ -220,7 +240,10 @@ def concatenate(sets: Sequence[GraspCandidates]) -> GraspCandidates:
         if len(values) > 1:
             raise InputError(f"candidates with different {name} cannot be joined: {', '.join(sorted(values))}")
     width = max(each.contacts.shape[1] for each in sets)
-    tables = [_widened(each, width) for each in sets]
+    points = {each.contact_map.shape[1] for each in sets}
+    if len(points - {0}) > 1:
+        raise InputError("candidates with contact maps over different numbers of points cannot be joined")
+    tables = [_widened(each, width) | {"contact_map": each.contact_map[:, : min(points)]} for each in sets]
     names = {name: None for table in tables for name in table}
     joined = {
         name: torch.cat(

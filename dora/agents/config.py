@@ -122,8 +122,11 @@ class RunConfig(Generic[Numbers, Settings, Agent]):
     """Parts of guidance in force, for ablations; None: all of them."""
     preset: Literal["none", "standard", "hard"] = "standard"
     """How much episodes are randomised and perturbed."""
+    reward: Literal["dense", "paper"] = "dense"
+    """The task's reward, or the equations that the paper prints, with their errors corrected."""
     seed: int = 0
-    """Seed of weights, exploration and initial states."""
+    """Seed of weights, exploration and initial states; with --eval-only of the starts (default: those that every run is
+    evaluated on at its end)."""
     total_steps: int = 300_000
     """Budget in environment steps, summed over all environments."""
     num_envs: int = 32
@@ -162,13 +165,17 @@ class RunConfig(Generic[Numbers, Settings, Agent]):
     def task_options(self) -> dict[str, Any]:
         """Arguments with which the task is made; without numbers of the task, its own are in force."""
         parts = None if self.guidance_parts is None else list(self.guidance_parts)
-        options = {"guidance": self.guidance, "guidance_parts": parts, "preset": self.preset}
+        options: dict[str, Any] = {"guidance": self.guidance, "guidance_parts": parts, "preset": self.preset}
+        options |= {"reward_mode": self.reward} if self.reward != "dense" else {}
         return options | ({"config": self.task} if self.task else {})
 
     def digest(self) -> str:
-        """Twelve hexadecimal digits that differ between settings; `total_steps` may grow and is left out."""
+        """Twelve hexadecimal digits that differ between settings; `total_steps` may grow and is left out, and so is the
+        dense reward, for settings of versions that had no other."""
         content = plain(self)
         del content["total_steps"]
+        if self.reward == "dense":
+            del content["reward"]
         return digest_of(content)[:12]
 
 

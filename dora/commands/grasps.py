@@ -15,6 +15,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from dora.affordance.contact_maps import map_bundled_set
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.importing import import_object
@@ -24,7 +25,7 @@ from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.sim.grasp_tests.bundle_maker import make_bundle
 from dora.sim.grasp_tests.generation import baselines, by_region, generate, summary, voting_summary
-from dora.sim.grasp_tests.report import check_out, print_report, write_report
+from dora.sim.grasp_tests.report import check_out, print_agreement, print_report, write_report
 from dora.tools.task_ranking import rank_bundled_set, tasks_of, usable_in_task
 
 INTERRUPTED = 130
@@ -73,6 +74,8 @@ class Args:
     simulated lifts or holds; then what --rank-in-task does, where a task uses the object."""
     rank_in_task: bool = False
     """Execute the bundled set of --object in the task that uses it, and rank it by the episodes that succeed."""
+    contact_maps: bool = False
+    """Make the contact semantic maps of the bundled set of --object anew, and print what they vote for."""
 
 
 def target(args: Args) -> tuple[AffordanceObject, str | None]:
@@ -127,12 +130,19 @@ def run(args: Args) -> None:
 
 
 def remake(args: Args) -> None:
-    """Make or rank the bundled set of an object."""
+    """Make or rank the bundled set of an object, or make its contact maps anew."""
     if args.object is None or args.mesh is not None:
-        raise InputError("--make-bundle and --rank-in-task need --object, for example --object jug, and no --mesh.")
+        raise InputError(
+            "--make-bundle, --rank-in-task and --contact-maps need --object, for example --object jug, and no --mesh."
+        )
     if args.kinematics != "compiled":
         raise InputError(f"--kinematics {args.kinematics} is for searches, not for --make-bundle or --rank-in-task.")
     name = args.object
+    if args.contact_maps and not (args.make_bundle or args.rank_in_task):
+        path, agreement = map_bundled_set(name)
+        print_agreement(agreement)
+        print(path)
+        return
     ids = tasks_of(load_object(name))
     with ProgressDisplay() as phases:
         if args.make_bundle:
@@ -146,7 +156,7 @@ def main() -> int:
     description = f"{__doc__}\nObjects: {', '.join(available_objects())}."
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=description)
     try:
-        if args.make_bundle or args.rank_in_task:
+        if args.make_bundle or args.rank_in_task or args.contact_maps:
             remake(args)
         else:
             run(args)

@@ -2,6 +2,8 @@
 
     python experiments/run.py --env DoraCube-v1
     python experiments/run.py --env DoraCube-v1 --task.lift 0.12 --learner.gamma 0.97
+    python experiments/run.py --eval-only --checkpoint FOLDER --seed 1 --episodes 50 --video
+    python experiments/run.py --eval-only --zero-correction --env DoraCube-v1
 
 Trains with the recommended settings, evaluates the best policy on fixed seeds and writes a run folder, whose
 path is the last line printed. Ctrl-C saves; `--resume FOLDER` goes on. Every number of the task and of the learner is
@@ -22,8 +24,8 @@ import tyro
 
 from dora.agents.checkpoint import read_checkpoint
 from dora.agents.config import LEARNER_CONFIGS, Agent, Numbers, RunConfig, Settings
-from dora.agents.evaluation.evaluate import outcome
-from dora.agents.evaluation.play import checkpoint_path, evaluate_checkpoint, load_policy, record
+from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed, outcome
+from dora.agents.evaluation.play import checkpoint_path, evaluate_checkpoint, evaluate_zero, load_policy, record
 from dora.agents.runs.recommended import check, recommended
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.agents.runs.trainer import Trainer
@@ -41,6 +43,8 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 BAD_INPUT = 2
 """Exit status after input that a person can mend."""
+ZERO = "zero"
+"""Name of the agent that evaluates as zero correction."""
 SHOWN = "DoraHammer-v1"
 """Task whose defaults --help shows if --env names none."""
 
@@ -56,11 +60,15 @@ class Args(Generic[Numbers, Settings, Agent]):
     resume: Path | None = None
     """Run folder to go on with, from its last checkpoint; only --total-steps may differ."""
     eval_only: bool = False
-    """Evaluate --checkpoint instead of training."""
+    """Evaluate --checkpoint, or with --zero-correction alone the zero action of --env, instead of training."""
+    zero_correction: bool = True
+    """Evaluate the zero action, too, where it is that of a reference (default with --eval-only: no)."""
     checkpoint: Path | None = None
     """Checkpoint to evaluate: a .safetensors file, or a run folder for its best one."""
     video: bool = False
-    """Film a few episodes of the policy at the end (needs a Vulkan driver)."""
+    """Film a few episodes of the policy, after training or before evaluation (needs a Vulkan driver)."""
+    first_seed: Annotated[int, tyro.conf.Suppress] = FINAL_SEED
+    """Seed of the first episode that is evaluated or filmed with --eval-only."""
 
 
 def parse(words: Sequence[str]) -> Args[dict[str, Any], Any, str]:
@@ -74,12 +82,19 @@ def parse(words: Sequence[str]) -> Args[dict[str, Any], Any, str]:
     numbers = task_config(task.CONFIG, base.preset, base.task)
     agents = Literal[tuple(task.LEARNERS)]  # pyright: ignore[reportInvalidTypeForm]
     form: Any = Args[task.CONFIG, LEARNER_CONFIGS[base.agent], agents]  # pyright: ignore[reportInvalidTypeArguments, reportInvalidTypeForm]
-    args = tyro.cli(form, default=Args(run=replace(base, task=numbers)), description=__doc__, args=list(words))
+    default = Args(run=replace(base, task=numbers), zero_correction="--eval-only" not in words)
+    args = tyro.cli(form, default=default, description=__doc__, args=list(words))
     numbers = task_config(task.CONFIG, args.run.preset, args.run.task)
     config = replace(args.run, task=plain(numbers))
     check(config)
     guidance_in_force(config.guidance, config.guidance_parts)
-    return replace(args, run=config)
+    if not args.eval_only:
+        return replace(args, run=config)
+    if args.zero_correction and not config.has_prior:
+        raise InputError("--zero-correction needs guidance with a prior: without one there is nothing to correct.")
+    given = early_value(words, "--seed") is not None
+    first = first_seed(config.seed, config.final_episodes) if given else FINAL_SEED
+    return replace(args, run=config, first_seed=first)
 
 
 def settings_to_start_from(words: Sequence[str]) -> RunConfig:
@@ -89,9 +104,11 @@ def settings_to_start_from(words: Sequence[str]) -> RunConfig:
     if resume is not None:
         return RunFolder(Path(resume)).read_config()
     preset = early_value(words, "--preset")
-    if "--eval-only" in words:
-        if checkpoint is None:
-            raise InputError("--eval-only needs --checkpoint with a .safetensors file or a run folder.")
+    if "--eval-only" in words and checkpoint is None and not ("--zero-correction" in words and env is not None):
+        raise InputError(
+            "--eval-only needs --checkpoint with a .safetensors file or a run folder, or --zero-correction with --env."
+        )
+    if "--eval-only" in words and checkpoint is not None:
         config = read_checkpoint(checkpoint_path(Path(checkpoint))).config
         if preset is None:
             return config
@@ -128,10 +145,10 @@ def refuse_other_settings(folder: Path, stored: RunConfig, asked: RunConfig) -> 
             )
 
 
-def default_folder(config: RunConfig, suffix: str = "") -> Path:
+def default_folder(config: RunConfig, agent: str, suffix: str = "") -> Path:
     """runs/<env>/<agent>-<guidance>-s<seed>-<time>."""
     time = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    return Path("runs") / config.env / f"{config.agent}-{config.guidance}-s{config.seed}-{time}{suffix}"
+    return Path("runs") / config.env / f"{agent}-{config.guidance}-s{config.seed}-{time}{suffix}"
 
 
 def task_maker(config: RunConfig) -> Any:
@@ -147,9 +164,10 @@ def train(args: Args) -> tuple[Path, bool]:
         refuse_other_settings(args.resume, folder.read_config(), config)
         folder.write_config(config)
     else:
-        folder = RunFolder(args.out or default_folder(config))
+        folder = RunFolder(args.out or default_folder(config, config.agent))
         folder.create(config)
-    result = Trainer(config, task_maker(config), folder, resume=args.resume is not None).run()
+    trainer = Trainer(config, task_maker(config), folder, resume=args.resume is not None, zero=args.zero_correction)
+    result = trainer.run()
     if not result["finished"]:
         command = ["python", *sys.argv[:1], "--resume", str(folder.path)]
         print(f"Interrupted and saved. To go on: {shlex.join(command)}", file=sys.stderr)
@@ -159,37 +177,41 @@ def train(args: Args) -> tuple[Path, bool]:
 
 
 def evaluate_only(args: Args) -> Path:
-    """Evaluate a checkpoint into a new run folder, which is returned."""
-    assert args.checkpoint is not None
-    path, config = checkpoint_path(args.checkpoint), args.run
-    print(f"evaluation on {config.final_episodes} episodes ...", file=sys.stderr)
-    checkpoint, evaluation, zero = evaluate_checkpoint(path, config, task_maker(config))
-    print(outcome(evaluation, zero), file=sys.stderr)
-    folder = RunFolder(args.out or default_folder(config, "-eval"))
-    folder.create(config)
+    """Film, if asked for, and evaluate a checkpoint or zero correction into a new run folder, which is returned."""
+    config = args.run
+    path = None if args.checkpoint is None else checkpoint_path(args.checkpoint)
+    agent = ZERO if path is None else config.agent
+    folder = RunFolder(args.out or default_folder(config, agent, "-eval"))
+    progress: dict[str, Any] = {"env_steps": 0, "wall_seconds": 0.0, "episodes": 0, "curve": []}
+
+    def begin() -> None:
+        folder.create(config)
+        if args.video:
+            film(path, config, folder.video / ("best.mp4" if path else "zero.mp4"), args.first_seed)
+        print(f"evaluation on {config.final_episodes} episodes ...", file=sys.stderr)
+
+    settings = config, task_maker(config)
+    if path is None:
+        begin()
+        evaluation = zero = evaluate_zero(*settings, args.first_seed)
+        print(f"without any correction: {outcome(evaluation, None)}", file=sys.stderr)
+    else:
+        options: Any = {"zero": args.zero_correction, "first_seed": args.first_seed, "before": begin}
+        checkpoint, evaluation, zero = evaluate_checkpoint(path, *settings, **options)
+        progress = {name: checkpoint.progress.get(name, value) for name, value in progress.items()}
+        print(outcome(evaluation, zero), file=sys.stderr)
     folder.write_evaluation(evaluation)
-    folder.write_result(
-        make_result(
-            config,
-            env_steps=checkpoint.progress["env_steps"],
-            wall_seconds=checkpoint.progress["wall_seconds"],
-            episodes=checkpoint.progress["episodes"],
-            evaluation=evaluation,
-            zero=zero,
-            finished=True,
-        )
-    )
-    if args.video:
-        film(path, config, folder.video / "best.mp4")
+    result = make_result(config, evaluation=evaluation, zero=zero, finished=True, **progress)
+    folder.write_result(result | {"agent": agent, "checkpoint": None if path is None else str(path)})
     return folder.path
 
 
-def film(checkpoint: Path, config: RunConfig, path: Path) -> None:
-    """Film the policy of a checkpoint, or say in one line why not."""
-    policy = load_policy(read_checkpoint(checkpoint), checkpoint)
+def film(checkpoint: Path | None, config: RunConfig, path: Path, seed: int = FINAL_SEED) -> None:
+    """Film the policy of a checkpoint, or zero correction without one, or say in one line why not."""
+    act = None if checkpoint is None else load_policy(read_checkpoint(checkpoint), checkpoint).greedy
     make_single_task = functools.partial(task_maker(config), 1, render_mode="rgb_array")
     try:
-        record(make_single_task, policy.greedy, path, VIDEO_EPISODES)
+        record(make_single_task, act, path, VIDEO_EPISODES, seed)
     except (RuntimeError, InputError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         print(f"No video: nothing can be rendered here ({reason}).", file=sys.stderr)

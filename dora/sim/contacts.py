@@ -12,7 +12,7 @@ from torch import Tensor
 from dora.errors import InputError
 from dora.sim.batch.queries import ContactScanner
 from dora.sim.batch.scene import BatchScene
-from dora.sim.substeps import watch_physics
+from dora.sim.substeps import watch_contacts
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class ContactMonitor:
             scene.px.stepper.scanners.append(self._scanner)
         if every_step:
             self._collector = _GroupScanner(readers, groups, wanted, places)
-            watch_physics(scene, self._collector.scan)
+            watch_contacts(scene, self._collector.take)
 
     def read(self) -> Contacts:
         """Contacts of the last physics step."""

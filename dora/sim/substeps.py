@@ -25,3 +25,17 @@ def watch_physics(scene: ManiSkillScene, watch: Callable[[int], None]) -> None:
         watch(0)
 
     scene.step = step_and_watch
+
+
+def watch_contacts(scene: ManiSkillScene, watch: Callable[[int, list], None]) -> None:
+    """Registers a function that is shown the contacts of each physics step of each environment.
+
+    Args:
+        scene: as for `watch_physics`.
+        watch: called with the index of the environment and SAPIEN's contacts, which it must not keep: SAPIEN frees
+            them in the next step. The contacts are those of the poses before the step; their impulses are the step's.
+    """
+    if isinstance(scene, BatchScene):
+        scene.px.stepper.contact_watchers.append(watch)
+    else:
+        watch_physics(scene, lambda environment: watch(environment, scene.px.get_contacts()))

@@ -65,6 +65,8 @@ class CubeWeights(PenaltyWeights):
 class CubeConfig(TaskConfig):
     """Numbers of the task."""
 
+    persistent_contacts: bool = False
+    """PhysX keeps contact points from step to step (PCM); it misses fingers that slide over the cube's edges."""
     centre: tuple[float, float] = (0.55, 0.0)
     """Middle of the area where the cube starts [m]."""
     spread: float = 0.08

@@ -14,6 +14,8 @@ CONTACT_DISTANCE = 5e-3
 """Distance between hand and surface below which they are in contact [m]."""
 CHUNK = 2_000_000
 """Point-capsule pairs evaluated at once; bounds the memory."""
+SLACK = 1e-4
+"""Margin of the balls around capsules, above the error of distances that are computed by matrix products [m]."""
 
 
 def contact_semantic_map(
@@ -52,15 +54,25 @@ def contact_semantic_map(
 def _nearest_part(
     points: Tensor, start: Tensor, end: Tensor, radius: Tensor, part: Tensor, contact_distance: float
 ) -> Tensor:
-    """Contact class (c, p) of points (p, 3) by the nearest of k capsules with axes from `start` to `end` (c, k, 3)."""
-    axis = end - start
+    """Contact class (c, p) of points (p, 3) by the nearest of k capsules with axes from `start` to `end` (c, k, 3).
+
+    A capsule is compared with the points in the ball around it only.
+    """
+    (count, capsules, _), size = start.shape, len(points)
+    axis = (end - start).flatten(0, 1)
+    ball = axis.norm(dim=-1) / 2 + radius.repeat(count) + contact_distance + SLACK
+    near = torch.cdist((start + end).flatten(0, 1) / 2, points) < ball[:, None]
+    row, point = near.nonzero().unbind(1)
+    capsule, cell = row % capsules, row.div(capsules, rounding_mode="floor") * size + point
+    axis, away = axis[row], points[point] - start.flatten(0, 1)[row]
     square = axis.square().sum(-1).clamp_min(torch.finfo(axis.dtype).tiny)
-    along = torch.einsum("pi,cki->cpk", points, axis) - (start * axis).sum(-1).unsqueeze(1)
-    share = (along / square.unsqueeze(1)).clamp(0, 1)
-    nearest = start.unsqueeze(1) + share.unsqueeze(-1) * axis.unsqueeze(1)
-    gap = (points[:, None] - nearest).norm(dim=-1) - radius
-    distance, capsule = gap.min(-1)
-    return torch.where(distance < contact_distance, part[capsule], 0)
+    share = ((away * axis).sum(-1) / square).clamp(0, 1)
+    gap = (away - share[:, None] * axis).norm(dim=-1) - radius[capsule]
+    least = gap.new_full((count * size,), contact_distance).scatter_reduce_(0, cell, gap, "amin")
+    winning = (gap < contact_distance) & (gap == least[cell])
+    winner = capsule.new_full((count * size,), capsules)
+    winner.scatter_reduce_(0, cell[winning], capsule[winning], "amin")
+    return torch.cat([part, part.new_zeros(1)])[winner].view(count, size)
 
 
 def hand_contacts(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from dora.affordance.maps.affordance_map import AffordanceMap
@@ -74,13 +74,44 @@ def vote(
     cell = (finger.clamp(0, HAND_PARTS) * labels).unsqueeze(-1) + near
     counts = contacts.new_zeros(len(contacts), (HAND_PARTS + 1) * labels)
     counts.scatter_add_(1, cell.flatten(1), torch.ones_like(cell, dtype=counts.dtype).flatten(1))
-    counts = counts.unflatten(1, (HAND_PARTS + 1, labels))[:, 1:]
+    return _decided(counts.unflatten(1, (HAND_PARTS + 1, labels))[:, 1:], settings)
+
+
+def vote_over_map(
+    map: AffordanceMap, contact_map: UInt8[Tensor, "b p"], settings: VotingSettings = STANDARD
+) -> Int[Tensor, " b"]:
+    """The vote as the paper prints it: the contacts p_i are all points of M_Aff that M_CoS gives to a part of the hand.
+
+    Equations, ties and result are those of `vote`. A point's own label is the first of its N neighbours; a part that is
+    near many points has many contacts, but as many votes as any other.
+
+    Args:
+        map: affordance map M_Aff of the object, with p points.
+        contact_map: (b, p) contact semantic maps M_CoS over the same points: 0 no contact, 1 palm, 2 thumb ... 6 pinky.
+        settings: N and the weights.
+
+    Raises:
+        InputError: the contact maps are over another number of points.
+    """
+    if contact_map.shape[1] != len(map):
+        raise InputError(
+            f"the contact maps have {contact_map.shape[1]} points and the affordance map of {map.name} {len(map)}: "
+            "make them anew with experiments/grasps.py --contact-maps."
+        )
+    _, near = map.nearest(map.points, settings.neighbours)
+    around = torch.nn.functional.one_hot(near, len(map.names)).sum(1).to(map.points)
+    counts = [(contact_map == part).to(around) @ around for part in range(1, HAND_PARTS + 1)]
+    return _decided(torch.stack(counts, 1), settings)
+
+
+def _decided(counts: Float[Tensor, "b parts labels"], settings: VotingSettings) -> Int[Tensor, " b"]:
+    """Mode of every part, and the region with the largest sum of weights, from how often each part is near a label."""
     overall = counts.sum(1, keepdim=True)
     preference = overall / (overall.sum(-1, keepdim=True) + 1)
     choice = (counts + preference * (counts > 0)).argmax(-1)
     voting = counts.sum(-1) > 0
     weights = torch.where(voting, counts.new_tensor(settings.weights), 0.0)
-    sums = counts.new_zeros(len(counts), labels).scatter_add_(1, choice, weights)
+    sums = counts.new_zeros(len(counts), counts.shape[2]).scatter_add_(1, choice, weights)
     smallest = min(settings.weights)
     winner = (sums + preference.squeeze(1) * _TIE * smallest).argmax(-1)
     return torch.where(voting.any(-1), winner, NO_CONTACT)

@@ -42,7 +42,10 @@ class ReachSettings:
         table_clearance: smallest height of hand and arm above the table [m].
         overlap: largest penetration depth of the opened hand in the object on the approach [m]; at the end of the
             approach the hand is meant to touch it.
-        clearance: smallest distance from the object in the transit [m].
+        clearance: smallest distance of the arm from the object [m].
+        brush: how deep the hand would be in the object if that stood still in the transit [m]; up to this it pushes the
+            object a little, and the grasp succeeds as often as without (docs/reachability.md).
+        graze: the same of two links of the arm, which slide along each other; on the approach they must not touch.
         speed: speed of the wrist on the approach [m/s], at which no joint may exceed its velocity limit.
         seeds: number of seeds of the inverse kinematics per candidate.
         stride: control steps between two postures that are checked with motion "controller".
@@ -57,6 +60,8 @@ class ReachSettings:
     table_clearance: float = 0.002
     overlap: float = 0.003
     clearance: float = 0.003
+    brush: float = 0.02
+    graze: float = 0.01
     speed: float = 0.15
     seeds: int = 8
     stride: int = 3
@@ -92,7 +97,11 @@ class ApproachPaths:
 
 
 def attempts(
-    kinematics: InverseKinematics, goals: Goals, start: Float[Tensor, " dof"], settings: ReachSettings
+    kinematics: InverseKinematics,
+    goals: Goals,
+    start: Float[Tensor, " dof"],
+    settings: ReachSettings,
+    up: Float[Tensor, " 3"],
 ) -> Iterator[Callable[[Int[Tensor, " m"]], ApproachPaths]]:
     """Functions from rows of `goals` to paths, the best paths first; call the next one for rows that failed.
 
@@ -101,9 +110,10 @@ def attempts(
         goals: n wrist poses with approaches.
         start: (dof,) arm joints from which motions start [rad].
         settings: numbers of the filter.
+        up: upward direction in the base frame.
     """
     if settings.motion == "controller":
-        yield lambda rows: _controller_paths(kinematics, goals[rows], start, settings)
+        yield lambda rows: _controller_paths(kinematics, goals[rows], start, settings, up)
         return
     solutions = kinematics.solve(goals.position, goals.quaternion, settings.seeds)
     for index in range(settings.seeds):
@@ -116,11 +126,11 @@ def _count(settings: ReachSettings) -> int:
 
 
 def _controller_paths(
-    kinematics: InverseKinematics, goals: Goals, start: Tensor, settings: ReachSettings
+    kinematics: InverseKinematics, goals: Goals, start: Tensor, settings: ReachSettings, up: Tensor
 ) -> ApproachPaths:
     """Paths of the wrist controller; the failure is "out of reach" where the inverse kinematics finds no solution."""
     path = goals.position, goals.quaternion, goals.approach, settings.standoff
-    m = roll_out(kinematics.chain, start, *path, settings.controller)
+    m = roll_out(kinematics.chain, start, *path, settings.controller, up)
     failure = torch.where(m.reached, OK, NO_MOTION)
     lost = (~m.reached).nonzero()[:, 0]
     solved = kinematics.solve(goals.position[lost], goals.quaternion[lost], settings.seeds).solved[:, 0]

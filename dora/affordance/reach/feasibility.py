@@ -144,7 +144,7 @@ class Reach:
         standoff_q = arm_q.clone()
         rows = (reason == OK).nonzero()[:, 0]
         left = torch.arange(len(rows))
-        for attempt in attempts(self.kinematics, goals[rows], self.start, s):
+        for attempt in attempts(self.kinematics, goals[rows], self.start, s, self._normal):
             if len(left) == 0:
                 break
             paths, now = attempt(left), rows[left]
@@ -284,10 +284,10 @@ class Reach:
                 "hand": {"hand object": -s.overlap},
                 "approach": {"arm": 0.0, "arm object": s.clearance},
                 "transit": {
-                    "arm": 0.0,
+                    "arm": -s.graze,
                     "table": s.table_clearance,
                     "arm object": s.clearance,
-                    "hand object": s.clearance,
+                    "hand object": -s.brush,
                 },
             }[name]
             table = (*self._normal.tolist(), self._level)

@@ -14,7 +14,7 @@ from torch import Tensor
 from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.hand.postures import pregrasp, squeeze
-from dora.affordance.maps.contact_semantic_map import pressed_contacts
+from dora.affordance.maps.contact_semantic_map import contact_semantic_map, pressed_contacts
 from dora.affordance.maps.voting import NO_CONTACT, vote
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.search.backends import check_kinematics, closing_model_of, described, energy_of
@@ -141,13 +141,15 @@ def _candidates(
     poses, joints, wrist = poses[best], rows.joints[best], rows.wrist[best]
     closed_wrist, closed_joints = (part[best] for part in closed)
     points, finger = pressed_contacts(hand, energy.field, hand.forward(closed_wrist, closed_joints))
-    voted = vote(map_of(obj, str(points.device)), points, finger)
+    regions = map_of(obj, str(points.device))
+    voted = vote(regions, points, finger)
+    position, quaternion = wrist[:, :3, 3].contiguous(), quaternion_from_matrix(wrist[:, :3, :3])
     full = robot.expand_hand(joints)
     normal = full.new_tensor(hand.palm_frame.normal)
     return GraspCandidates(
         object=obj.name,
-        position=wrist[:, :3, 3].contiguous(),
-        quaternion=quaternion_from_matrix(wrist[:, :3, :3]),
+        position=position,
+        quaternion=quaternion,
         approach=wrist[:, :3, :3] @ normal,
         pregrasp=opened(energy, wrist, full),
         grasp=squeeze(robot, full),
@@ -155,6 +157,7 @@ def _candidates(
         joints=full,
         contacts=points,
         contact_finger=finger,
+        contact_map=contact_semantic_map(regions.points, position, quaternion, full, hand).byte(),
         energy={name: value[best] for name, value in (found.terms | predicted).items()},
         penetration=depth[best],
         self_penetration=self_depth[best],

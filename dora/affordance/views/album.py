@@ -5,20 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.contact_maps import mapped
+from dora.affordance.maps.voting import NO_CONTACT, vote_over_map
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import available_objects, load_object
-from dora.affordance.search.cache import map_of
+from dora.affordance.search.cache import hand_of, map_of
 from dora.affordance.views.map_pictures import picture_map
-from dora.affordance.views.page import Surface
 from dora.affordance.views.pictures import caption, picture_contacts, picture_grasps, picture_objects
+from dora.affordance.views.surface import Surface
 from dora.errors import InputError
 from dora.robot import RobotDescription
 
 SHOWN = 4
 """Largest number of grasps in a picture."""
-EDGE = 0.002
-"""Longest edge of the triangles that carry the colours of a contact semantic map [m]."""
+FINER = 2.0
+"""Ratio of the edges of triangles on a page to those in a picture of contact semantic maps [1]."""
 OBJECTS = "objects.png"
 """File name of the picture of all objects."""
 
@@ -44,9 +45,12 @@ def write_album(
         return paths[:1]
     shown = candidates.select(chosen(candidates))
     picture_grasps(shown, obj, robot, paths[1])
-    surface, hand = Surface(obj, EDGE), HandModel(robot)
-    maps = [surface.parts(shown, row, hand) for row in range(len(shown))]
-    titles = [caption(shown, row) for row in range(len(shown))]
+    surface = Surface(obj, FINER)
+    shown = mapped(shown, surface.map, hand_of(robot, "cpu"))
+    maps = [surface.parts(each) for each in shown.contact_map]
+    voted = vote_over_map(surface.map, shown.contact_map).tolist()
+    held = ["nothing" if label == NO_CONTACT else obj.labels[label] for label in voted]
+    titles = [(caption(shown, row), f"the other side; the map votes for {name}") for row, name in enumerate(held)]
     picture_contacts(surface.mesh, maps, titles, obj.name, paths[2])
     return paths
 

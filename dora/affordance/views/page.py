@@ -8,34 +8,31 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.hand_mesh import GAMMA, HandMesh, face_colours
-from dora.affordance.hand.hand_model import HandModel
-from dora.affordance.maps.contact_semantic_map import contact_semantic_map
+from dora.affordance.contact_maps import mapped
+from dora.affordance.hand.hand_mesh import HandMesh, face_colours
+from dora.affordance.maps.voting import NO_CONTACT, vote_over_map
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.palette import PALETTE, colours
+from dora.affordance.search.cache import hand_of
 from dora.affordance.views.pictures import PARTS
+from dora.affordance.views.surface import Surface, unshared
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_matrix
 from dora.robot import RobotDescription
 
 MOST_HANDS = 16
 """Largest number of hands that a page shows at once."""
-EDGE = 0.004
-"""Longest edge of the triangles that carry colours [m]."""
-MOST_CUTS = 12
-"""Largest number of times that a triangle is subdivided."""
 CONTACT_SIZE = 0.004
 """Diameter of a contact point [m]."""
 VIEWPOINT = 1.0
 """Distance of the first view along x and y, in diagonals of the object [1]."""
 AMBIENT = 1.5
 """Intensity of the ambient light; with viser's own lights alone dark links are black [1]."""
-REGIONS, CONTACTS = "affordance regions", "contacts of the grasp"
+REGIONS, CONTACTS = "affordance regions", "contact semantic map"
 """Choices of what the colours of the surface mean."""
 ANY_VALIDITY, VALID, INVALID = "all", "valid", "not valid"
 """Choices of the filter by validity."""
@@ -69,8 +66,9 @@ class Filter:
 
 
 def describe(candidates: GraspCandidates, row: int) -> str:
-    """Markdown about one candidate: class, validity, score, penetration depths, contacts and energies."""
+    """Markdown about one candidate: class, validity, score, penetration depths, contacts, contact map and energies."""
     names = list(PARTS)
+    points = torch.bincount(candidates.contact_map[row].long(), minlength=len(names)).tolist()
     touching = sorted({int(f) for f in candidates.contact_finger[row] if f > 0})
     score = float(candidates.score[row])
     lines = [
@@ -80,53 +78,10 @@ def describe(candidates: GraspCandidates, row: int) -> str:
         f"- {1000 * float(candidates.penetration[row]):.2f} mm into the object",
         f"- {1000 * float(candidates.self_penetration[row]):.2f} mm into itself",
         f"- contacts: {', '.join(names[f] for f in touching) or 'none'}",
+        f"- contact map: {', '.join(f'{n} {k}' for n, k in zip(names[1:], points[1:], strict=True) if k) or 'none'}",
         *(f"- {name}: {float(value[row]):.3g}" for name, value in candidates.energy.items()),
     ]
     return "\n".join(lines)
-
-
-class Surface:
-    """The object's mesh, subdivided into triangles with edges of at most `edge` [m], each with a colour."""
-
-    def __init__(self, obj: AffordanceObject, edge: float = EDGE) -> None:
-        vertices, faces, *origin = trimesh.remesh.subdivide_to_size(
-            obj.mesh.vertices, obj.mesh.faces, edge, MOST_CUTS, return_index=True
-        )
-        self.mesh = trimesh.Trimesh(vertices, faces, process=False)
-        self.labels = obj.face_labels[origin[0]]
-        self.centres = torch.tensor(self.mesh.triangles_center, dtype=torch.float32)
-
-    def regions(self) -> UInt8[np.ndarray, "f 4"]:
-        """Face colours of the affordance map."""
-        return colours(self.labels, PALETTE)
-
-    def contacts(self, candidates: GraspCandidates, row: int, hand: HandModel) -> UInt8[np.ndarray, "f 4"]:
-        """Face colours of the contact semantic map of one candidate."""
-        return colours(self.parts(candidates, row, hand), tuple(PARTS.values()))
-
-    def parts(self, candidates: GraspCandidates, row: int, hand: HandModel) -> Int[np.ndarray, " f"]:
-        """The contact semantic map of one candidate: for each face the part of the hand, an index into `PARTS`."""
-        one = candidates.select([row])
-        part = contact_semantic_map(self.centres, one.position, one.quaternion, one.joints, hand)
-        return part[0].numpy()
-
-    def painted(self, face_colours: UInt8[np.ndarray, "f 4"]) -> trimesh.Trimesh:
-        """The mesh in these face colours, with separate vertices for each face."""
-        return unshared(self.mesh, face_colours)
-
-
-def unshared(mesh: trimesh.Trimesh, face_colours: np.ndarray) -> trimesh.Trimesh:
-    """A mesh with separate vertices for each face, so that glTF keeps the edges between colours, which are linear."""
-    linear = (255 * (face_colours[:, :3] / 255) ** GAMMA).round()
-    corners = mesh.triangles.reshape(-1, 3)
-    normals = mesh.vertex_normals[mesh.faces].reshape(-1, 3)
-    return trimesh.Trimesh(
-        corners,
-        np.arange(len(corners)).reshape(-1, 3),
-        vertex_normals=normals,
-        vertex_colors=np.repeat(linear.astype(np.uint8), 3, axis=0),
-        process=False,
-    )
 
 
 class Hands:
@@ -202,10 +157,13 @@ class GraspPage:
         port: int = 8080,
         host: str = "127.0.0.1",
     ) -> None:
-        self.obj, self.candidates = obj, candidates
+        self.obj = obj
         self.server = start_server(host, port, f"Dora: {obj.name}")
         self.surface = Surface(obj)
-        self.model = HandModel(robot)
+        self.candidates = candidates
+        if candidates is not None:
+            self.candidates = candidates = mapped(candidates, self.surface.map, hand_of(robot, "cpu"))
+            self.voted = vote_over_map(self.surface.map, candidates.contact_map).tolist()
         self.server.scene.set_up_direction("+z")
         self.server.scene.add_light_ambient("/ambient", intensity=AMBIENT)
         away = VIEWPOINT * float(np.linalg.norm(obj.mesh.extents))
@@ -226,7 +184,7 @@ class GraspPage:
     def _add_legend(self) -> None:
         rows = [("Regions", dict(zip(self.obj.labels, PALETTE * len(self.obj.labels), strict=False)))]
         if self.candidates is not None:
-            rows.append(("Contacts", PARTS))
+            rows.append(("Contact map", PARTS))
         with self.server.gui.add_folder("Colours"):
             for title, table in rows:
                 boxes = " ".join(
@@ -280,10 +238,14 @@ class GraspPage:
         if not rows:
             self.text.content = "No grasp passes the filter."
         else:
-            self.text.content = f"grasp {first + 1} of {len(rows)}\n\n{describe(self.candidates, rows[first])}"
+            row = rows[first]
+            label = "nothing" if self.voted[row] == NO_CONTACT else self.obj.labels[self.voted[row]]
+            self.text.content = (
+                f"grasp {first + 1} of {len(rows)}\n\n{describe(self.candidates, row)}\n- the map votes for {label}"
+            )
         self.hands.show(self.candidates.select(shown) if shown else None)
         if rows and self.colouring.value == CONTACTS:
-            self._paint(self.surface.contacts(self.candidates, rows[first], self.model))
+            self._paint(self.surface.contacts(self.candidates.contact_map[rows[first]]))
         else:
             self._paint(self.surface.regions())
         self._show_contacts(rows[first] if rows else None)

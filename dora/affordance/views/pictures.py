@@ -95,7 +95,7 @@ def picture_grasps(
 def picture_contacts(
     mesh: trimesh.Trimesh,
     faces: Sequence[Int[np.ndarray, " f"]],
-    titles: Sequence[str],
+    titles: Sequence[tuple[str, str]],
     name: str,
     path: Path | str,
 ) -> None:
@@ -104,7 +104,7 @@ def picture_contacts(
     Args:
         mesh: the object's surface, subdivided finely enough to carry colours [m].
         faces: per map the class (f,) of every face, 0 to 6.
-        titles: titles of the maps.
+        titles: of every map, above its two views.
         name: name of the object.
         path: path of the file.
 
@@ -113,10 +113,10 @@ def picture_contacts(
     """
     table = tuple(PARTS.values())
     front, back = [], []
-    for classes, title in zip(faces, titles, strict=True):
+    for classes, (title, other) in zip(faces, titles, strict=True):
         painted = trimesh.Trimesh(mesh.vertices, mesh.faces, face_colors=colours(classes, table), process=False)
         azimuth = _towards(mesh, classes > 0)
-        for panels, turn, words in ((front, 0.0, title), (back, np.pi, "the other side")):
+        for panels, turn, words in ((front, 0.0, title), (back, np.pi, other)):
             camera = Camera.around([painted], azimuth + turn, VIEW[1])
             panels.append(Panel(render([painted], camera, TILE, TILE), words))
     write_sheet([*front, *back], path, len(front), PARTS, name)

@@ -19,7 +19,10 @@ class Task(Protocol):
     `reset` and `step` return observations (N, O) float32. `step` returns reward (N,), terminated (N,),
     truncated (N,) and an info with `success` (N,) bool (whether the episode so far counts as a success),
     optionally `fail` (N,) bool (the episode cannot go on) and every name of `logged`, each (N,).
-    Success does not end an episode: it runs to `max_steps` unless it fails.
+    Success does not end an episode: it runs to `max_steps` unless it fails. Evaluation understands, if they are
+    logged, `raw_success` (success without regard to overlap), `success_at_end` (success, and what was reached still
+    holds now), `penetration_mm` and `nonfinite` (the simulator gave NaN or infinity). A task may have an attribute
+    `ranking_steps`: simulated steps that ranking its candidates took.
     """
 
     @property
@@ -83,7 +86,7 @@ class EpisodeColumns:
     """Names of the columns of the statistics that `TaskEnv` keeps of each running episode.
 
     last: value at the present step (1 for `success` at the end of the episode).
-    highest: largest value so far (stage flags, penetration).
+    highest: largest value so far (stage flags, penetration, non-finite states).
     total: sum over the steps so far (return, length, reward terms).
     """
 
@@ -94,8 +97,8 @@ class EpisodeColumns:
     @classmethod
     def of(cls, logged: Sequence[str]) -> "EpisodeColumns":
         """Sort the names that a task logs into columns."""
-        last = tuple(n for n in logged if n.startswith("success") and n != "success")
-        highest = tuple(n for n in logged if n.startswith(("stage/", "penetration")))
+        last = tuple(n for n in logged if n.startswith(("success", "raw_success")) and n != "success")
+        highest = tuple(n for n in logged if n.startswith(("stage/", "penetration", "nonfinite")))
         total = tuple(n for n in logged if n not in {*last, *highest, "success"})
         return cls(("success", "whole", *last), highest, ("return", "length", *total))
 

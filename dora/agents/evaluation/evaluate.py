@@ -10,13 +10,33 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from dora.agents.collecting.task_env import EpisodeColumns, TaskEnv
+from dora.agents.evaluation.intervals import share_text, wilson
+from dora.errors import InputError
 
 PERIODIC_SEED = 1_000_000_000
 """Seed of the first episode of evaluations during training; all training seeds are smaller."""
 FINAL_SEED = 1_500_000_000
-"""Seed of the first episode of the evaluation that `result.json` reports."""
+"""Seed of the first episode of the evaluation at the end of training."""
+STARTS = 10_000
+"""Seeds that belong to each `--seed` of an evaluation [1]; so many episodes have starts of their own."""
+MOST_SEEDS = 200_000
+"""Values of `--seed` whose starts have seeds that NumPy takes [1]: all are below 2^32."""
 
 Act = Callable[[Float[Tensor, "n o"]], Float[Tensor, "n a"]]
+
+
+def first_seed(seed: int, episodes: int) -> int:
+    """Seed of the first episode of an evaluation on the starts of `seed`; no start belongs to two values of `seed`, to
+    training, or to an evaluation during or at the end of it.
+
+    Raises:
+        InputError: if there are no such starts, or fewer than `episodes`.
+    """
+    if not 0 <= seed < MOST_SEEDS:
+        raise InputError(f"--seed is {seed}; evaluation has starts for seeds from 0 to {MOST_SEEDS - 1}.")
+    if episodes > STARTS:
+        raise InputError(f"--episodes is {episodes}; a --seed of evaluation has {STARTS} starts: choose fewer.")
+    return FINAL_SEED + STARTS * (seed + 1)
 
 
 def no_correction(action_size: int) -> Act:
@@ -34,10 +54,14 @@ class Evaluation:
 
     columns: names of the columns of `table`.
     table: (E, K) values at the end of each episode.
+    first_seed: seed of the first episode; those of the others follow.
+    ranking_steps: simulated steps that ranking the task's candidates took; None if the task does not say.
     """
 
     columns: EpisodeColumns
     table: Float[Tensor, "e k"]
+    first_seed: int = FINAL_SEED
+    ranking_steps: int | None = None
 
     def values(self, name: str) -> Float[Tensor, " e"]:
         """One column, sums of logged terms as means per step."""
@@ -45,8 +69,34 @@ class Evaluation:
 
     @property
     def success_rate(self) -> float:
-        """Share of episodes that end in success."""
+        """Share of episodes that count as successes when they end."""
         return float(self.values("success").mean())
+
+    @property
+    def success_interval(self) -> tuple[float, float]:
+        """Wilson's interval of the success rate."""
+        return wilson(round(float(self.values("success").sum())), len(self.table))
+
+    @property
+    def success_text(self) -> str:
+        """The success rate with its interval."""
+        return share_text(self.success_rate, len(self.table))
+
+    @property
+    def raw_success_rate(self) -> float | None:
+        """The same, overlap not counted; None if the task reports no overlap."""
+        return float(self.values("raw_success").mean()) if "raw_success" in self.columns.last else None
+
+    @property
+    def success_at_end_rate(self) -> float:
+        """Share of successes in which what was reached still holds in the last step, as far as the task says."""
+        name = "success_at_end" if "success_at_end" in self.columns.last else "success"
+        return float(self.values(name).mean())
+
+    @property
+    def nonfinite_episodes(self) -> int:
+        """Episodes in which the simulator gave NaN or infinity, as far as the task says."""
+        return int(self.values("nonfinite").sum()) if "nonfinite" in self.columns.highest else 0
 
     @property
     def return_mean(self) -> float:
@@ -102,8 +152,8 @@ def run_batch(env: TaskEnv, act: Act, first_seed: int) -> Float[Tensor, "n k"]:
 
 def outcome(evaluation: Evaluation, zero: Evaluation | None) -> str:
     """One line about the last evaluation of a policy and, if there is a prior, of zero correction."""
-    text = f"success {evaluation.success_rate:.3f}"
+    text = f"success {evaluation.success_text}"
     if zero is not None:
-        text += f", without any correction {zero.success_rate:.3f}"
+        text += f", without any correction {zero.success_text}"
     depth = evaluation.penetration_p95_mm
     return text + (f", penetration p95 {depth:.1f} mm" if depth is not None else "")

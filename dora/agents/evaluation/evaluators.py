@@ -5,35 +5,42 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from dora.agents.collecting.task_env import TaskEnv, TaskFactory
+from dora.agents.collecting.task_env import MakeTask, TaskEnv
 from dora.agents.config import RunConfig
-from dora.agents.evaluation.evaluate import FINAL_SEED, Evaluation, no_correction, run_batch
+from dora.agents.evaluation.evaluate import FINAL_SEED, Act, Evaluation, no_correction, run_batch
 from dora.agents.learners.learner import make_learner
 from dora.agents.learners.networks import Policy
 from dora.parallel import WorkerPool
 
+FEWEST = 2
+"""Environments of the smallest batch [1]: sums over a single one are rounded in another order."""
 Weights = dict[str, np.ndarray]
 """A policy's parameters and buffers; torch would send tensors as shared files."""
-Batch = tuple[Weights | None, int]
-"""What a batch of episodes depends on: the weights, None for no correction, and the seed of its first episode."""
+Batch = tuple[Weights | None, int, int]
+"""What a batch of episodes depends on: the weights, None for no correction, the seed of its first episode, and how many
+there are."""
 
 
 class Evaluators:
     """Evaluates policies in this process and in helpers, which start when there is something to do for them.
 
-    A batch of `config.eval_envs` episodes gives the same rows in whatever process it runs.
+    Batches have `config.eval_envs` episodes, the last one those that are left. An episode gives the same row in
+    whatever process it runs, and however many others there are.
 
     Args:
-        make_task: makes a batch of `config.eval_envs` tasks; picklable.
+        make_task: makes a batch of tasks; picklable.
         config: settings of the run; up to `workers` processes evaluate, this one included.
+        episodes: most episodes of an evaluation, if known: fewer than `config.eval_envs` need no more environments.
     """
 
-    def __init__(self, make_task: TaskFactory, config: RunConfig):
+    def __init__(self, make_task: MakeTask, config: RunConfig, episodes: int | None = None):
         self._own, self._config = _Evaluator(make_task, config), config
         self._helpers = WorkerPool(_Evaluator, (make_task, config), max(config.workers, 1) - 1)
-        self.env, self.sizes = self._own.env, self._own.sizes
+        self.env = self._own.env(min(episodes or config.eval_envs, config.eval_envs))
+        self.sizes = _sizes(self.env)
 
     def run(
         self, policy: Policy | None, episodes: int, first_seed: int, check: Callable[[], None] = lambda: None
@@ -51,44 +58,83 @@ class Evaluators:
             Exception: what a task raised first, here or in a helper.
         """
         weights = None if policy is None else {k: v.numpy(force=True) for k, v in policy.state_dict().items()}
-        starts = range(0, episodes, self.env.batch_size[0])
-        batches = [(weights, first_seed + start) for start in starts]
+        size = self._config.eval_envs
+        batches = [(weights, first_seed + start, min(size, episodes - start)) for start in range(0, episodes, size)]
         tables = self._helpers.map(batches, functools.partial(self._own, check=check), check=check)
-        return Evaluation(self.env.columns, torch.from_numpy(np.concatenate(tables)[:episodes]))
+        table = torch.from_numpy(np.concatenate(tables))
+        return Evaluation(self.env.columns, table, first_seed, getattr(self.env.task, "ranking_steps", None))
 
-    def final(self, policy: Policy, check: Callable[[], None] = lambda: None) -> tuple[Evaluation, Evaluation | None]:
-        """Evaluate a policy, and no correction if there is a prior, on `config.final_episodes` episodes whose seeds
-        no training or periodic evaluation uses; arguments and errors as for `run`."""
+    def final(
+        self,
+        policy: Policy,
+        check: Callable[[], None] = lambda: None,
+        *,
+        zero: bool = True,
+        first_seed: int = FINAL_SEED,
+    ) -> tuple[Evaluation, Evaluation | None]:
+        """Evaluate a policy and, with `zero` and if there is a prior, no correction on `config.final_episodes` episodes
+        whose seeds no training or periodic evaluation uses; other arguments and errors as for `run`."""
         episodes = self._config.final_episodes
-        evaluation = self.run(policy, episodes, FINAL_SEED, check)
-        return evaluation, self.run(None, episodes, FINAL_SEED, check) if self._config.has_prior else None
+        evaluation = self.run(policy, episodes, first_seed, check)
+        zero = zero and self._config.has_prior
+        return evaluation, self.run(None, episodes, first_seed, check) if zero else None
 
     def close(self) -> None:
         """End the helpers and close the environments."""
         self._helpers.close()
-        self.env.close()
+        self._own.close()
 
 
 class _Evaluator:
     """Tasks and a policy whose weights come with each batch; arguments as for `Evaluators`."""
 
-    def __init__(self, make_task: TaskFactory, config: RunConfig):
-        self.env = TaskEnv(make_task())
-        self.sizes = (self.env.observation_spec["observation"].shape[-1], self.env.action_spec.shape[-1])
-        with torch.random.fork_rng(devices=[]):
-            self._policy = make_learner(config, *self.sizes).policy
+    def __init__(self, make_task: MakeTask, config: RunConfig):
+        self._make_task, self._config = make_task, config
+        self._envs: dict[int, TaskEnv] = {}
+        self._policy: Policy | None = None
+
+    def env(self, episodes: int) -> TaskEnv:
+        """The environments of a batch, made when they are first needed."""
+        size = min(max(episodes, FEWEST), self._config.eval_envs)
+        if size not in self._envs:
+            self._envs[size] = TaskEnv(self._make_task(size))
+        return self._envs[size]
 
     def __call__(self, batch: Batch, check: Callable[[], None] = lambda: None) -> np.ndarray:
         """Rows (n, k) of an evaluation's table; `check` is called every control step."""
-        weights, seed = batch
-        act = no_correction(self.sizes[1])
-        if weights is not None:
-            self._policy.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
-            act = self._policy.greedy
+        weights, seed, episodes = batch
+        env = self.env(episodes)
+        act = no_correction(_sizes(env)[1]) if weights is None else self._greedy(weights, _sizes(env))
 
         def checked(observation: Tensor) -> Tensor:
             check()
             return act(observation)
 
         with torch.random.fork_rng(devices=[]):
-            return run_batch(self.env, checked, seed).numpy(force=True)
+            return run_batch(env, checked, seed)[:episodes].numpy(force=True)
+
+    def _greedy(self, weights: Weights, sizes: tuple[int, int]) -> Act:
+        """The policy with these weights. It always computes `eval_envs` rows, because a matrix product of fewer rows
+        is rounded otherwise, and contacts make much of it."""
+        if self._policy is None:
+            with torch.random.fork_rng(devices=[]):
+                self._policy = make_learner(self._config, *sizes).policy
+        policy = self._policy
+        policy.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
+
+        def act(observation: Float[Tensor, "n o"]) -> Float[Tensor, "n a"]:
+            rows = observation.new_zeros(self._config.eval_envs, observation.shape[1])
+            rows[: len(observation)] = observation
+            return policy.greedy(rows)[: len(observation)]
+
+        return act
+
+    def close(self) -> None:
+        """Close the environments."""
+        for env in self._envs.values():
+            env.close()
+
+
+def _sizes(env: TaskEnv) -> tuple[int, int]:
+    """Numbers of observation and action components."""
+    return env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]

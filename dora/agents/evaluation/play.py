@@ -1,7 +1,6 @@
 """Evaluation of a checkpoint, and films of a policy."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from torch import Tensor
 from dora.agents.checkpoint import Checkpoint, check_belongs, read_checkpoint, unpack_modules
 from dora.agents.collecting.task_env import MakeTask, Task
 from dora.agents.config import RunConfig
-from dora.agents.evaluation.evaluate import FINAL_SEED, Act, Evaluation
+from dora.agents.evaluation.evaluate import FINAL_SEED, Act, Evaluation, no_correction
 from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.learner import make_learner
 from dora.agents.learners.networks import Policy
@@ -41,27 +40,60 @@ def load_policy(checkpoint: Checkpoint, path: Path) -> Policy:
 
 
 def evaluate_checkpoint(
-    path: Path, config: RunConfig, make_task: MakeTask
+    path: Path,
+    config: RunConfig,
+    make_task: MakeTask,
+    *,
+    zero: bool = True,
+    first_seed: int = FINAL_SEED,
+    before: Callable[[], None] = lambda: None,
 ) -> tuple[Checkpoint, Evaluation, Evaluation | None]:
-    """Evaluate a checkpoint on the seeds of final evaluations; with guidance also no correction.
+    """Evaluate a checkpoint on `config.final_episodes` episodes, by default those of final evaluations.
 
     The networks are those of the checkpoint, whatever `config.learner` says.
+
+    Args:
+        path: of the checkpoint.
+        config: settings of the task and of the evaluation.
+        make_task: makes a batch of tasks; picklable.
+        zero: evaluate no correction, too, if there is a prior.
+        first_seed: seed of the first episode.
+        before: called when the checkpoint has been found to fit.
 
     Raises:
         InputError: if it is no checkpoint or belongs to another task, learner or guidance.
     """
     checkpoint = read_checkpoint(path)
     settings = dataclasses.replace(config, learner=checkpoint.config.learner)
-    evaluators = Evaluators(functools.partial(make_task, config.eval_envs), settings)
+    evaluators = Evaluators(make_task, settings, config.final_episodes)
     try:
         check_belongs(checkpoint, path, config, evaluators.sizes, exactly=False)
-        return checkpoint, *evaluators.final(load_policy(checkpoint, path))
+        before()
+        return checkpoint, *evaluators.final(load_policy(checkpoint, path), zero=zero, first_seed=first_seed)
     finally:
         evaluators.close()
 
 
-def record(make_task: Callable[[], Task], act: Act, path: Path, episodes: int) -> None:
+def evaluate_zero(config: RunConfig, make_task: MakeTask, first_seed: int = FINAL_SEED) -> Evaluation:
+    """Evaluate no correction of a task without any policy; arguments as for `evaluate_checkpoint`."""
+    evaluators = Evaluators(make_task, config, config.final_episodes)
+    try:
+        return evaluators.run(None, config.final_episodes, first_seed)
+    finally:
+        evaluators.close()
+
+
+def record(
+    make_task: Callable[[], Task], act: Act | None, path: Path, episodes: int, first_seed: int = FINAL_SEED
+) -> None:
     """Film whole episodes of a task with one environment that can `render()`, one after the other.
+
+    Args:
+        make_task: makes that environment.
+        act: the policy; None for no correction.
+        path: of the film.
+        episodes: number of episodes.
+        first_seed: seed of the first one; those of the others follow.
 
     Raises:
         RuntimeError: if nothing can be rendered, for want of a driver.
@@ -69,13 +101,14 @@ def record(make_task: Callable[[], Task], act: Act, path: Path, episodes: int) -
     task: Any = make_task()
     try:
         low, high = (torch.as_tensor(x) for x in (task.single_action_space.low, task.single_action_space.high))
+        act = act or no_correction(len(low))
         path.parent.mkdir(parents=True, exist_ok=True)
         with torch.no_grad():
-            first = _frames(task, act, FINAL_SEED, low, high)
+            first = _frames(task, act, first_seed, low, high)
             rate = getattr(task, "control_freq", FRAMES_PER_SECOND)
             with imageio.get_writer(path, fps=rate, macro_block_size=8) as writer:
                 for episode in range(episodes):
-                    frames = first if episode == 0 else _frames(task, act, FINAL_SEED + episode, low, high)
+                    frames = first if episode == 0 else _frames(task, act, first_seed + episode, low, high)
                     for frame in frames:
                         writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
     finally:

@@ -13,6 +13,8 @@ TAGS: dict[str, str] = {
     "evaluation/penetration_p95_mm": "95th percentile of the largest penetration of evaluation episodes [mm]",
     "evaluation/stage/<name>": "share of evaluation episodes that reached the stage",
     "episode/success_rate": "share of this iteration's training episodes that end in success",
+    "episode/raw_success_rate": "the same, overlap not counted",
+    "episode/success_at_end_rate": "share of successes in which what was reached still holds in the last step",
     "episode/return_mean": "mean sum of rewards of those episodes",
     "episode/length_mean": "mean length of those episodes [control steps]",
     "episode/reward/<term>": "mean per control step of the reward term over those episodes, weight included",

@@ -34,8 +34,8 @@ class RunFolder:
     """Paths and writers of one run.
 
     `config.yaml`, `versions.txt`, TensorBoard events, `checkpoints/{latest,best}.safetensors`,
-    `checkpoints/replay/` (SAC), `curve.csv` (one row per evaluation), `eval.csv` (one row per episode of the
-    last evaluation), `result.json`, `video/`.
+    `checkpoints/replay/` (SAC), `progress.csv` (one row per iteration), `curve.csv` (one row per evaluation),
+    `eval.csv` (one row per episode of the last evaluation), `result.json`, `video/`.
     """
 
     path: Path
@@ -59,6 +59,11 @@ class RunFolder:
     def replay(self) -> Path:
         """Folder of the replay buffer."""
         return self.checkpoints / "replay"
+
+    @property
+    def progress(self) -> Path:
+        """Table of the iterations of training."""
+        return self.path / "progress.csv"
 
     @property
     def video(self) -> Path:
@@ -123,9 +128,10 @@ def make_result(
     episodes: int,
     evaluation: Evaluation | None,
     zero: Evaluation | None,
+    curve: list[list[Any]],
     finished: bool,
 ) -> dict[str, Any]:
-    """Content of `result.json`; rates are null where nothing was evaluated."""
+    """Content of `result.json`; rates are null where nothing was evaluated. `curve` has the rows of `curve.csv`."""
     rate = env_steps / wall_seconds if wall_seconds > 0 else 0.0
     some = evaluation
     return {
@@ -152,7 +158,23 @@ def make_result(
         "eval_episodes": len(some.table) if some else 0,
         "penetration_p95_mm": some.penetration_p95_mm if some else None,
         "guidance_parts": config.task_options["guidance_parts"],
+        "success_interval": list(some.success_interval) if some else None,
+        "raw_success_rate": some.raw_success_rate if some else None,
+        "success_at_end_rate": some.success_at_end_rate if some else None,
+        "nonfinite_episodes": some.nonfinite_episodes if some else None,
+        "ranking_steps": some.ranking_steps if some else None,
+        "steps_to_50": steps_to(0.5, curve),
+        "steps_to_80": steps_to(0.8, curve),
+        "reward": config.reward,
+        "total_steps": config.total_steps,
+        "first_seed": some.first_seed if some else None,
     }
+
+
+def steps_to(success: float, curve: list[list[Any]]) -> int | None:
+    """Environment steps of the first row of a learning curve with this success rate; None if there is none."""
+    at, rate = CURVE_HEADER.index("env_steps"), CURVE_HEADER.index("success_rate")
+    return next((row[at] for row in curve if row[rate] >= success), None)
 
 
 def source_commit() -> str | None:

@@ -2,7 +2,6 @@
 
 import functools
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,18 +22,27 @@ from dora.agents.checkpoint import (
     unpack_rng,
 )
 from dora.agents.collecting.rollouts import Rollouts
+from dora.agents.collecting.task_env import EpisodeColumns, MakeTask, ended_episodes
 from dora.agents.config import RunConfig
-from dora.agents.collecting.task_env import MakeTask, EpisodeColumns, Task, ended_episodes
 from dora.agents.evaluation.evaluate import PERIODIC_SEED, Evaluation, outcome
 from dora.agents.evaluation.evaluators import Evaluators
-from dora.agents.runs.interrupt import Interrupt
 from dora.agents.learners.learner import Learner, make_learner
+from dora.agents.runs.interrupt import Interrupt
 from dora.agents.runs.logging import RunLog
+from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.progress import ProgressDisplay
 
 TRAINING_SEEDS = 1_000_000_000
 """Seeds of training are below this number, those of evaluation are not."""
+RENAMED = {
+    "success": "success_rate",
+    "raw_success": "raw_success_rate",
+    "success_at_end": "success_at_end_rate",
+    "return": "return_mean",
+    "length": "length_mean",
+}
+"""Names of the means of the columns of episodes."""
 RECENT = 200
 """Number of latest training episodes over which the displayed success rate is taken."""
 
@@ -69,16 +77,19 @@ class Trainer:
         make_task: makes tasks for workers and for evaluation.
         folder: an existing run folder.
         resume: go on from the folder's latest checkpoint.
+        zero: evaluate zero correction at the end, too, if there is a prior.
 
     Raises:
         InputError: if the checkpoint does not fit.
     """
 
-    def __init__(self, config: RunConfig, make_task: MakeTask, folder: RunFolder, *, resume: bool = False):
-        self.config, self.make_task, self.folder = config, make_task, folder
+    def __init__(
+        self, config: RunConfig, make_task: MakeTask, folder: RunFolder, *, resume: bool = False, zero: bool = True
+    ):
+        self.config, self.make_task, self.folder, self._zero = config, make_task, folder, zero
         torch.set_num_threads(config.learner_threads)
         self.counters = Counters(next_evaluation=config.eval_every)
-        self._evaluators = Evaluators(functools.partial(make_task, config.eval_envs), config)
+        self._evaluators = Evaluators(make_task, config)
         self.columns: EpisodeColumns = self._evaluators.env.columns
         self.sizes = self._evaluators.sizes
         weights_seed, self._exploration_seed = seeds_for(config.seed, 0, 2)
@@ -99,6 +110,7 @@ class Trainer:
         first_step = self.counters.env_steps
         with Interrupt() as interrupt:
             log = RunLog(self.folder.path, first_step)
+            self._table = ProgressTable(self.folder.progress, self._evaluators.env.task.stage_names, first_step)
             finished = False
             try:
                 with self._rollouts() as rollouts, ProgressDisplay() as progress:
@@ -121,6 +133,7 @@ class Trainer:
             episodes=self.counters.episodes,
             evaluation=evaluation,
             zero=zero,
+            curve=self.counters.curve,
             finished=finished,
         )
         if evaluation is not None:
@@ -192,16 +205,11 @@ class Trainer:
         log.add_learner(values, step)
         shares = {f"{k}_share": v / counters.wall_seconds for k, v in counters.seconds.items()}
         log.add("speed", {"steps_per_second": rate, **shares}, step)
-        if len(ended) == 0:
-            return
         self._recent = torch.cat([self._recent, ended])[-RECENT:]
-        renamed = {"success": "success_rate", "return": "return_mean", "length": "length_mean"}
-        means = {
-            renamed.get(name, name): float(self.columns.column(ended, name).mean())
-            for name in self.columns.names
-            if name != "whole"
-        }
+        names = [name for name in self.columns.names if name != "whole"] if len(ended) else []
+        means = {RENAMED.get(name, name): float(self.columns.column(ended, name).mean()) for name in names}
         log.add("episode", means, step)
+        self._table.add({"env_steps": step, "seconds": counters.wall_seconds, "episodes": len(ended)} | means)
 
     def _evaluation_is_due(self) -> bool:
         return self.counters.env_steps >= self.counters.next_evaluation
@@ -226,7 +234,7 @@ class Trainer:
         counters.curve.append([counters.env_steps, round(counters.wall_seconds, 2), *row])
         self.folder.write_curve(counters.curve)
         progress.say(
-            f"{counters.env_steps:,} steps, {counters.wall_seconds:.0f} s: success {success:.3f}, "
+            f"{counters.env_steps:,} steps, {counters.wall_seconds:.0f} s: success {evaluation.success_text}, "
             f"return {mean_return:.2f}" + (f", penetration p95 {depth:.1f} mm" if depth is not None else "")
         )
         if counters.best is None or [success, mean_return] > counters.best:
@@ -248,7 +256,7 @@ class Trainer:
             unpack_modules(self.learner.policy.modules_by_name, best.tensors, self.folder.best)
         else:
             self._keep_as_best()
-        evaluation, zero = self._evaluators.final(self.learner.policy, interrupt.check)
+        evaluation, zero = self._evaluators.final(self.learner.policy, interrupt.check, zero=self._zero)
         self._spend("evaluate", time.perf_counter() - start)
         return evaluation, zero
 

@@ -1,6 +1,6 @@
 """Rollouts of the tasks' wrist controller without a simulator: batched and purely kinematic.
 
-The wrist moves straight to the standoff of a candidate and then straight along the approach. Each control step is a
+The wrist moves to the standoff of a candidate, above it while it still has to turn, and then straight along the approach. Each control step is a
 displacement of bounded length, turned into joint steps by damped least squares within position and velocity limits.
 The branch of the inverse kinematics, stalls at joint limits and slow motion near singularities are those of the task.
 """
@@ -27,8 +27,9 @@ class Controller:
         speed: largest speed of the wrist [m/s].
         spin: largest angular speed of the wrist [rad/s].
         descent: speed at which the standoff shrinks [m/s].
+        hover: height above the beginning of the approach that the wrist keeps for each radian it has to turn [m/rad].
         arrived: errors at the standoff below which the descent begins [m], [rad].
-        settled: errors below which the candidate is reached [m], [rad]; half of what closes the tasks' hand.
+        settled: errors below which the candidate is reached [m], [rad]; those that close the tasks' hand.
         patience: number of control steps after which a motion has failed.
     """
 
@@ -36,8 +37,9 @@ class Controller:
     speed: float = 0.6
     spin: float = 2.0
     descent: float = 0.15
+    hover: float = 0.0
     arrived: tuple[float, float] = (0.02, 0.15)
-    settled: tuple[float, float] = (0.004, 0.04)
+    settled: tuple[float, float] = (0.008, 0.08)
     patience: int = 90
 
 
@@ -66,6 +68,7 @@ def roll_out(
     approach: Float[Tensor, "n 3"],
     standoff: float,
     controller: Controller,
+    up: Float[Tensor, " 3"],
 ) -> Motions:
     """Motions from one posture to many wrist poses.
 
@@ -77,6 +80,7 @@ def roll_out(
         approach: (n, 3) unit direction of the approach, in the base frame.
         standoff: length of the approach [m].
         controller: numbers of the controller.
+        up: upward direction in the base frame.
 
     Returns:
         The motions; t is the number of steps until the last one has ended, plus one.
@@ -92,7 +96,9 @@ def roll_out(
     for step in range(c.patience):
         frames = chain.forward(q)
         error = pose_error(frames, position - approach * back[:, None], rotation)
-        shift, turn = error[:, :3], error[:, 3:]
+        turn = error[:, 3:]
+        hover = torch.where(descending, 0.0, c.hover * turn.norm(dim=-1))
+        shift = error[:, :3] + hover[:, None] * up
         away, angle = shift.norm(dim=-1), turn.norm(dim=-1)
         begins = ~descending & (away < c.arrived[0]) & (angle < c.arrived[1])
         arrival[left[begins]] = step
@@ -101,11 +107,10 @@ def roll_out(
         if done.any():
             finish[left[done]] = step
             keep = ~done
-            q, error, away, angle, back, descending, left = (
-                x[keep] for x in (q, error, away, angle, back, descending, left)
+            q, shift, turn, away, angle, back, descending, left = (
+                x[keep] for x in (q, shift, turn, away, angle, back, descending, left)
             )
             position, rotation, approach = position[keep], rotation[keep], approach[keep]
-            shift, turn = error[:, :3], error[:, 3:]
             if not len(left):
                 break
             frames = type(frames)(*(x[keep] for x in frames))

@@ -51,16 +51,19 @@ class Stepper:
     read; then the next environment follows. `defer` delays writes and steps to that end. Environments do not
     interact, so results do not depend on this order.
 
-    Each of `watchers` is called with the index of an environment after each of its physics steps.
+    Each of `watchers` is called with the index of an environment after each of its physics steps, and each of
+    `contact_watchers` with the contacts of that step as well.
     """
 
     def __init__(self, scenes: Sequence[sapien.Scene]):
         systems: list[Any] = [scene.physx_system for scene in scenes]
         self.poses = PackedSource([scene.pack_poses for scene in scenes])
         self.state = PackedSource([system.pack for system in systems])
-        self.contacts = ContactImpulses([system.get_contacts for system in systems])
+        self._read_contacts = [system.get_contacts for system in systems]
+        self.contacts = ContactImpulses(self._read_contacts)
         self.scanners: list[ContactScanner] = [self.contacts]
         self.watchers: list[Callable[[int], None]] = []
+        self.contact_watchers: list[Callable[[int, list], None]] = []
         self.profile: StepProfile | None = None
         self.resized: Callable[[], None] = lambda: None
         self._steps = [system.step for system in systems]
@@ -121,6 +124,14 @@ class Stepper:
                 step()
                 for watch in self.watchers:
                     watch(environment)
+                if self.contact_watchers:
+                    if profile:
+                        profile.add("physics")
+                    contacts = self._read_contacts[environment]()
+                    for look in self.contact_watchers:
+                        look(environment, contacts)
+                    if profile:
+                        profile.add("contacts")
             if profile:
                 profile.add("physics")
             for source in sources:

@@ -13,11 +13,12 @@ from jaxtyping import Int
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
+from dora.affordance.contact_maps import mapped
 from dora.affordance.hand.grasp_test_settings import STANDARD, GraspTestSettings
 from dora.affordance.maps.confusion import Confusion, clearly_dominant
-from dora.affordance.maps.voting import vote
+from dora.affordance.maps.voting import vote, vote_over_map
 from dora.affordance.objects.affordance_object import AffordanceObject
-from dora.affordance.search.cache import map_of
+from dora.affordance.search.cache import hand_of, map_of
 from dora.affordance.search.energies import Weights
 from dora.affordance.search.optimise import Settings, optimise
 from dora.digests import digest_of
@@ -40,8 +41,11 @@ BASELINES = {
 after the search (`unseated`); without both; with a single iteration."""
 
 
-CANDIDATE, CLOSED = "candidate", "closed_hand"
-"""Kinds of contacts that vote: those stored with the candidate, and those of the simulated hand after closing."""
+CANDIDATE, MAP, CLOSED = "candidate", "contact_map", "closed_hand"
+"""What votes: the contacts stored with the candidate, its contact semantic map (the vote as the paper prints it), and
+the contacts of the simulated hand after closing."""
+KINDS = (CANDIDATE, MAP, CLOSED)
+"""All that vote, in the order of reports."""
 FREE = "any"
 """Name of a search without a region."""
 
@@ -59,7 +63,7 @@ class Generated:
         seed: seed of the search.
         optimise_seconds, validate_seconds: wall time of search and validation [s].
         verdict: results of the simulation; None without one.
-        voting: votes (c,) by the kind of contacts, `CANDIDATE` and `CLOSED`; empty without a simulation.
+        voting: votes (c,) by what votes, `CANDIDATE`, `MAP` and `CLOSED`; empty without a simulation.
     """
 
     candidates: GraspCandidates
@@ -114,7 +118,7 @@ def generate(
     verdict, voting = None, {}
     if simulate:
         verdict = validate(found, obj, robot, test_settings, progress=phases.phase(f"{name}: simulation", "candidates"))
-        valid, voting = verdict.valid, votes(found, verdict, obj)
+        valid, voting = verdict.valid, votes(found, verdict, obj, robot)
         found = replace(found, grasp_class=_classes(found, voting[CLOSED], obj))
     else:
         valid = (found.penetration <= test_settings.penetration) & (found.contact_finger > 0).any(1)
@@ -197,11 +201,15 @@ def by_region(
     }
 
 
-def votes(candidates: GraspCandidates, verdict: Validation, obj: AffordanceObject) -> dict[str, Int[Tensor, " c"]]:
-    """Votes of the contacts stored with the candidates and of those after closing; -1 without contact."""
+def votes(
+    candidates: GraspCandidates, verdict: Validation, obj: AffordanceObject, robot: RobotDescription
+) -> dict[str, Int[Tensor, " c"]]:
+    """Votes of the contacts stored with the candidates, of their maps, and of the contacts after closing; -1: none."""
     regions = map_of(obj, "cpu")
+    maps = mapped(candidates.to("cpu"), regions, hand_of(robot, "cpu")).contact_map
     return {
         CANDIDATE: vote(regions, candidates.contacts.cpu(), candidates.contact_finger.cpu()),
+        MAP: vote_over_map(regions, maps),
         CLOSED: vote(regions, verdict.contacts, verdict.contact_finger),
     }
 
@@ -211,12 +219,13 @@ def voting_summary(several: Iterable[Generated], obj: AffordanceObject) -> dict[
 
     The groups are the simulated grasps of all searches together with contact force after closing ("all"), those with
     a dominant region ("clear", see `clearly_dominant`), and the valid ones among both ("valid", "valid_clear").
+    "map_by_closed_hand" counts the grasps of "all" by the vote of the closed hand (row) and of the map (column).
     """
     simulated = [(g.verdict, g.voting) for g in several if g.verdict is not None]
     force = torch.cat([verdict.label_force for verdict, _ in simulated])
     pressed, clear = force.sum(1) > 0, clearly_dominant(force)
     valid = torch.cat([verdict.valid for verdict, _ in simulated])
-    voted = {kind: torch.cat([votes[kind] for _, votes in simulated]) for kind in (CANDIDATE, CLOSED)}
+    voted = {kind: torch.cat([votes[kind] for _, votes in simulated]) for kind in KINDS}
     groups = {"all": pressed, "clear": clear, "valid": pressed & valid, "valid_clear": clear & valid}
     found: dict[str, Any] = {"labels": list(obj.labels)}
     for group, rows in groups.items():
@@ -228,7 +237,8 @@ def voting_summary(several: Iterable[Generated], obj: AffordanceObject) -> dict[
                 "recall": confusion.recall,
                 "confusion": confusion.counts.tolist(),
             }
-    return found
+    both = Confusion.of(obj.labels, voted[MAP][pressed], voted[CLOSED][pressed])
+    return found | {"map_by_closed_hand": both.counts.tolist()}
 
 
 def _classes(candidates: GraspCandidates, voted: Int[Tensor, " c"], obj: AffordanceObject) -> tuple[str, ...]:

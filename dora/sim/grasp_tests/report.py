@@ -11,8 +11,10 @@ from rich.console import Console
 from rich.table import Table
 
 from dora.affordance.candidates import GraspCandidates
+from dora.affordance.maps.confusion import Confusion
 from dora.errors import InputError
 from dora.files import write_json
+from dora.sim.grasp_tests.generation import KINDS
 
 SUFFIX = ".safetensors"
 """Suffix of a file of candidates."""
@@ -61,7 +63,7 @@ def _votes(voting: dict[str, Any]) -> Table:
     for heading in ("grasps", "contacts", "balanced accuracy", *(f"{name} held: voted" for name in labels)):
         table.add_column(heading, overflow="fold")
     for group in ("all", "clear", "valid", "valid_clear"):
-        for kind in ("candidate", "closed_hand"):
+        for kind in KINDS:
             found = voting[group][kind]
             cells = [_confused(row, [*labels, "none"]) for row in found["confusion"]]
             accuracy = found["balanced_accuracy"]
@@ -70,6 +72,12 @@ def _votes(voting: dict[str, Any]) -> Table:
                 f"{group.replace('_', ', ')} ({voting[group]['grasps']})", kind.replace("_", " "), share, *cells
             )
     return table
+
+
+def print_agreement(agreement: Confusion) -> None:
+    """Print what the contact maps of grasps vote for, a line per region of their class."""
+    for name, row in zip(agreement.names, agreement.counts.tolist(), strict=True):
+        print(f"{name} {sum(row)}: contact maps vote {_confused(row, [*agreement.names, 'none'])}")
 
 
 def _confused(row: list[int], names: list[str]) -> str:

@@ -169,7 +169,9 @@ def tabulated_reach(arm: Arm, grid: Grid) -> ReachTable:
         arm.agent.description,
         obj,
         base=(arm.spec.position, arm.spec.quaternion),
-        settings=ReachSettings(controller=Controller(period=reference.dt, descent=reference.descent)),
+        settings=ReachSettings(
+            controller=Controller(period=reference.dt, descent=reference.descent, hover=reference.hover)
+        ),
         start=start_posture(arm.spec),
     )
     candidates = arm.guide.choice.candidates.to("cpu")

@@ -315,8 +315,7 @@ class DoraEnv(BaseEnv):
         """
         s, memory, finished, unreachable = self.snapshot, self.memory, self.machine.finished, self.unreachable
         info = {
-            "success": self.mdp.succeeded(finished, s, memory) & ~unreachable,
-            "fail": self.mdp.failed(s, memory) | unreachable,
+            **self.mdp.verdict(finished, unreachable, s, memory),
             "unreachable": unreachable,
             "finished": finished,
             "stage": self.machine.index.clone(),
@@ -374,7 +373,8 @@ class DoraEnv(BaseEnv):
     def logged(self) -> tuple[str, ...]:
         """Names of the (n,) tensors in `step`'s info that are worth a curve."""
         stages = [f"stage/{name}" for name in self.stage_names]
-        names = (*(f"reward/{name}" for name in self.terms.terms), *stages, "penetration_mm", "finished")
+        verdicts = ("raw_success", "success_at_end", "finished")
+        names = (*(f"reward/{name}" for name in self.terms.terms), *stages, "penetration_mm", *verdicts)
         return (*names, "unreachable") if FILTER in self.parts else names
 
     # ------------------------------------------------------------------- state

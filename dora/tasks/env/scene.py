@@ -170,6 +170,7 @@ def sim_config(c: TaskConfig) -> SimConfig:
             solver_position_iterations=c.solver_iterations,
             solver_velocity_iterations=1,
             sleep_threshold=0.0,
+            enable_pcm=c.persistent_contacts,
         ),
         default_materials_config=DefaultMaterialsConfig(static_friction=0.9, dynamic_friction=0.9),
     )

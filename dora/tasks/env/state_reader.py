@@ -11,6 +11,7 @@ from torch import Tensor
 from dora.geometry.rotations import quaternion_apply, quaternion_inverse
 from dora.sim.bodies import BodyReader
 from dora.sim.contacts import ContactMonitor
+from dora.sim.overlap import OverlapMonitor
 from dora.sim.robot_agent import DescribedRobot
 from dora.tasks.guidance.guide import Guide
 from dora.tasks.mdp.memory import EpisodeMemory
@@ -32,6 +33,9 @@ class StateReader:
         world: what objects and hands may touch besides each other.
         points: contact points of each hand with its object that are wanted; 0 if nobody asks for them.
         every_step: collect contacts from all physics steps of a control step, not from the last one only.
+
+    Attributes:
+        overlap: of robots and objects with each other and with the world, in every physics step.
     """
 
     def __init__(
@@ -60,6 +64,8 @@ class StateReader:
         located = [(part, handles[arm]) for arm in agents for part in parts[arm]] if points else []
         groups |= {name: [body] for name, body in objects.items()} | {WORLD: list(world)}
         self._contacts = ContactMonitor(scene, groups, pairs, located, every_step)
+        links = [link for agent in agents.values() for link in agent.robot.links]
+        self.overlap = OverlapMonitor(scene, [*links, *objects.values()])
         self.points = points * len(agents)
         """Rows of contact points of each hand: those of the other hands are empty."""
         self._rows = {arm: [list(groups).index(part) for part in parts[arm]] for arm in agents}
@@ -68,16 +74,14 @@ class StateReader:
         self._classes = torch.tensor([0, *known], device=scene.device)  # the first for an empty row
 
     def record(self, memory: EpisodeMemory, frequency: float) -> None:
-        """Writes the contacts of the last control step into the memory.
+        """Writes contacts and overlap of the last control step into the memory.
 
         Args:
             memory: of the episode.
             frequency: 1 / the time over which impulses were collected [Hz]: a physics step, or all of a control step.
         """
         contacts, count = self._contacts.take(), self._part_count
-        depth = (-contacts.separation).clamp(min=0)
-        hands = depth[:, :count, count:].flatten(1).amax(-1)
-        memory.record_penetration(torch.maximum(hands, depth[:, count:-1, -1].amax(-1)))
+        memory.record_penetration(self.overlap.take())
         for arm, rows in self._rows.items():
             column = count + self._names.index(self._handles[arm])
             force = contacts.impulse[:, rows[0] : rows[-1] + 1, column].norm(dim=-1) * frequency

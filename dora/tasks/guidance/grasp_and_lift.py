@@ -91,7 +91,7 @@ class GraspReference(Reference):
 
     def __init__(self, num_envs: int, dt: float, device: torch.device | str, settings: GraspSettings | None = None):
         self.settings = settings or GraspSettings()
-        self.descent = self.settings.descent
+        self.descent, self.hover = self.settings.descent, self.settings.hover
         super().__init__(
             phases(self.settings), num_envs, dt, device,
             standoff=(), closing=(), raised=(), waited=(), latched_p=(3,), latched_q=(4,), target_p=(3,), target_q=(4,),

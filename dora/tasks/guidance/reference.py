@@ -31,6 +31,8 @@ class Reference(ABC):
 
     descent: float = 0.15
     """Speed at which the standoff shrinks on the approach [m/s]; f_reach counts with it."""
+    hover: float = 0.0
+    """Height that the wrist keeps above the beginning of the approach for each radian it has to turn [m/rad]; the same."""
 
     def __init__(
         self,

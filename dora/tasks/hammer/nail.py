@@ -7,8 +7,9 @@ down, so that it never comes back up: while the nail moves,
     m a = F_hammer - resistance - drag * v,    v >= 0.
 
 The hammer's blow starts the nail at nearly the hammer's speed and is then spent against drag and resistance. Pushing
-moves it too, if slowly, and a nail pushed in has not been hammered: only what the nail sinks within `blow_window`
-after an impact above `blow_speed` counts as driven.
+moves it too, if slowly, and a nail pushed in has not been hammered: a blow is an impact above `blow_speed` of the
+hammer's striking face on the nail's head, and only what the nail sinks within `blow_window` after one counts as driven,
+while nothing but that face presses on the nail.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from mani_skill.utils.structs import Actor, Articulation, Link
 from sapien.physx import PhysxMaterial
 from torch import Tensor
 
-from dora.sim.substeps import watch_physics
+from dora.sim.substeps import watch_contacts
 
 HEAD_RADIUS, HEAD_HALF = 0.008, 0.002
 """Radius and half thickness of the nail's head as it is drawn [m]."""
@@ -40,6 +41,11 @@ MOVED = 1e-6
 """Sinking in one physics step that is motion and not rounding [m]."""
 WATCHED = 0.3
 """Distance of the hammer's centre from the nail within which its speed is watched [m]."""
+FACE_DEPTH, FACE_EDGE = 0.006, 0.003
+"""How far from the plane and beyond the edge of the striking face a contact point may lie that is on it [m]; the
+point of a contact lies between the two surfaces, which a blow presses into each other."""
+UPRIGHT = 0.7
+"""Smallest vertical share of a contact's normal that presses the nail down, not aside [1]."""
 DOWN = (0.7071068, 0.0, 0.7071068, 0.0)
 """Turns +x, the axis of joints and cylinders, into -z (wxyz): the joint's coordinate is the nail's depth."""
 PINE, IRON = (0.78, 0.60, 0.38, 1.0), (0.45, 0.46, 0.48, 1.0)
@@ -67,7 +73,7 @@ class NailSettings:
     blow_speed: float = 0.5
     """Speed of the striking face relative to the nail above which an impact is a blow [m/s]."""
     blow_window: float = 0.05
-    """Time after a blow in which the nail's motion counts as driven [s]."""
+    """Time after a blow in which the nail's motion counts as driven, if nothing else touches the nail [s]."""
 
 
 class Nail:
@@ -93,6 +99,9 @@ class Nail:
         self._speed = np.zeros(n, np.float32)
         self._hammers: list[sapien.physx.PhysxRigidDynamicComponent] = []
         self._faces: Float[np.ndarray, "n 3"] = np.zeros((n, 3))
+        self._radii: Float[np.ndarray, " n"] = np.zeros(n)
+        self._poses: list[Float[np.ndarray, "4 4"] | None] = [None] * n
+        self._nails = {id(body): i for i, body in enumerate(self.links[1]._bodies)}
         self._scene = scene
 
     @property
@@ -100,10 +109,11 @@ class Nail:
         """The post and the nail."""
         return self.articulation.links
 
-    def strike_with(self, hammer: Actor, faces: Float[np.ndarray, "n 3"]) -> None:
-        """Watches the blows of hammers whose striking faces have their centres at `faces` [m], object frame."""
-        self._hammers, self._faces = list(hammer._bodies), faces
-        watch_physics(self._scene, self._watch)
+    def strike_with(self, hammer: Actor, faces: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, " n"]) -> None:
+        """Watches the blows of hammers whose striking faces, discs across their x axes, have their centres at `faces`
+        and these radii [m], object frame."""
+        self._hammers, self._faces, self._radii = list(hammer._bodies), faces, radii
+        watch_contacts(self._scene, self._watch)
 
     def begin(self, rows: Int[Tensor, " b"]) -> None:
         """Pulls the nails of the environments `rows` out."""
@@ -114,6 +124,12 @@ class Nail:
             buffer[index] = 0.0
         self._since[index] = self.settings.blow_window
         self._hold(index.tolist())
+        self._look(index.tolist())
+
+    def _look(self, rows: list[int]) -> None:
+        """Takes note where the hammers are, which have been put elsewhere."""
+        for i in rows if self._hammers else []:
+            self._poses[i] = self._hammers[i].entity_pose.to_transformation_matrix()
 
     def _hold(self, rows: list[int]) -> None:
         """Lets nails rise no higher than they are, and presses them up."""
@@ -126,28 +142,55 @@ class Nail:
         travel = self.settings.travel
         self._joints[i].set_limits(np.array([[min(self._depth[i], travel - MOVED), travel]], np.float32))
 
-    def _watch(self, i: int) -> None:
+    def _watch(self, i: int, contacts: list) -> None:
         """After a physics step of environment i: the ratchet, and what the step's motion counts."""
         body, before = self._bodies[i], self._depth[i]
         depth = float(body.qpos[0])
         self._since[i] += self._dt
         if depth > before + MOVED:
-            if self._speed[i] > self.settings.blow_speed:
+            face, other = self._pressed(i, contacts)
+            if face and self._speed[i] > self.settings.blow_speed:
                 self._since[i] = 0.0
-            if self._since[i] < self.settings.blow_window:
+            if self._since[i] < self.settings.blow_window and not other:
                 self._driven[i] += depth - before
             self._depth[i] = depth
             self._limit(i)
         self._speed[i] = self._approach(i, float(body.qvel[0]))
 
+    def _pressed(self, i: int, contacts: list) -> tuple[bool, bool]:
+        """Whether the striking face pressed the nail down in the last physics step, and whether anything else touched
+        the nail."""
+        face = other = False
+        for contact in contacts:
+            one, two = contact.bodies
+            if id(one) not in self._nails and id(two) not in self._nails:
+                continue
+            hammer = self._hammers[i] in (one, two)
+            for point in contact.points:
+                if point.impulse.any():
+                    struck = hammer and self._on_face(i, point)
+                    face, other = face or struck, other or not struck
+        return face, other
+
+    def _on_face(self, i: int, point: sapien.physx.PhysxContactPoint) -> bool:
+        """Whether a contact point of hammer and nail was on the striking face, and pressed the nail down."""
+        pose = self._poses[i]
+        if pose is None or abs(point.normal[2]) < UPRIGHT:
+            return False
+        away = pose[:3, :3].T @ (point.position - pose[:3, 3]) - self._faces[i]
+        return bool(abs(away[0]) < FACE_DEPTH and np.hypot(away[1], away[2]) < self._radii[i] + FACE_EDGE)
+
     def _approach(self, i: int, nail_speed: float) -> float:
-        """Downward speed of the striking face relative to the nail [m/s]; 0 if the hammer is far away."""
+        """Downward speed of the striking face relative to the nail [m/s]; 0 if the hammer is far away. Keeps the
+        hammer's pose, in which the next physics step finds its contacts."""
         hammer = self._hammers[i]
         pose = hammer.entity_pose
         away = pose.p - self._place
         if away @ away > WATCHED * WATCHED:
+            self._poses[i] = None
             return 0.0
-        arm = pose.to_transformation_matrix()[:3, :3] @ self._faces[i]
+        self._poses[i] = matrix = pose.to_transformation_matrix()
+        arm = matrix[:3, :3] @ self._faces[i]
         spin = hammer.angular_velocity
         down = -(hammer.linear_velocity[2] + spin[0] * arm[1] - spin[1] * arm[0])
         return float(down) - nail_speed
@@ -173,6 +216,7 @@ class Nail:
         for name in ("_depth", "_driven", "_since", "_speed"):
             getattr(self, name)[index] = state[f"nail{name}"].reshape(-1).cpu().numpy()
         self._hold(index.tolist())
+        self._look(index.tolist())
 
 
 def _build(scene: ManiSkillScene, settings: NailSettings) -> Articulation:

@@ -27,6 +27,8 @@ class TaskConfig:
     """Physics steps per second [Hz]; a multiple of the control frequency."""
     solver_iterations: int = 6
     """PhysX position iterations [1]."""
+    persistent_contacts: bool = True
+    """PhysX keeps contact points from step to step (PCM); it misses fingers that slide over an edge, see findings."""
     contact_offset: float = 0.005
     """Distance at which PhysX begins to see a contact of a body without its own setting [m]."""
     penetration_limit: float = 0.005

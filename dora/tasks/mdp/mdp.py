@@ -49,7 +49,24 @@ class Mdp(Generic[S]):
     observations: Mapping[str, Entry] = field(default_factory=dict)
     failed: Callable[[Any, EpisodeMemory], Bool[Tensor, " n"]] = left_table
 
-    def succeeded(self, finished: Bool[Tensor, " n"], s: S, memory: EpisodeMemory) -> Bool[Tensor, " n"]:
-        """All stages are done, no overlap of the episode was above the limit, and nothing has failed now, as a jug
-        that is dropped again has."""
-        return finished & (memory.max_penetration <= self.penetration_limit) & ~self.failed(s, memory)
+    def verdict(
+        self, finished: Bool[Tensor, " n"], unreachable: Bool[Tensor, " n"], s: S, memory: EpisodeMemory
+    ) -> dict[str, Bool[Tensor, " n"]]:
+        """What the episodes count as now.
+
+        Args:
+            finished: all stages are done, now or earlier.
+            unreachable: no candidate could be reached, which fails the episode at once.
+            s: the present state.
+            memory: what is remembered of the episodes.
+
+        Returns:
+            `fail`: nothing can mend the episode, such as that of a jug that is dropped again. `raw_success`: finished
+            and not failed. `success`: besides, no overlap of the episode was above the limit. `success_at_end`:
+            besides, this very state passes the test of the last stage, without its hold.
+        """
+        failed = self.failed(s, memory) | unreachable
+        raw = finished & ~failed
+        success = raw & (memory.max_penetration <= self.penetration_limit)
+        now = success & self.stages[-1].done(s)
+        return {"success": success, "raw_success": raw, "success_at_end": now, "fail": failed}

@@ -1,0 +1,123 @@
+"""Figures of a report: greedy evaluations during training, and smoothed curves of the training itself."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from dora.agents.runs.run_results import Group, Run, grouped, zero_shares
+
+COLOURS = {
+    ("PPO", "affordance"): "#c0392b",
+    ("PPO", "none"): "#e59866",
+    ("SAC", "affordance"): "#1f618d",
+    ("SAC", "none"): "#85c1e9",
+}
+"""Line colour of each learner with and without guidance; others take matplotlib's."""
+SECONDS_PER_MINUTE = 60.0
+"""Seconds per minute [s]."""
+EPOCHS = 10_000
+"""Epochs of the paper's trainings [1]: one of its epochs is this share of a budget."""
+SIGMA = 200
+"""Standard deviation of the Gaussian with which the paper smooths its curves, in its epochs [1]."""
+GRID = 200
+"""Points of a smoothed curve [1]."""
+TRAINING = (
+    ("success_rate", "training success"), ("return_mean", "training return"), ("penetration_mm", "overlap [mm]"),
+)  # fmt: skip
+"""Columns of `progress.csv` that are drawn, and their labels."""
+
+
+def smoothed(
+    at: Float[np.ndarray, " p"],
+    steps: Float[np.ndarray, " rows"],
+    values: Float[np.ndarray, " rows"],
+    weights: Float[np.ndarray, " rows"],
+    sigma: float,
+) -> Float[np.ndarray, " p"]:
+    """Mean of values around each place, weighted by a Gaussian; NaN where there are none.
+
+    Args:
+        at: places [environment steps].
+        steps: places of the values [environment steps].
+        values: NaN is left out.
+        weights: of the values, such as the episodes over which each is a mean.
+        sigma: standard deviation of the Gaussian [environment steps].
+    """
+    known = np.isfinite(values) & (weights > 0)
+    kernel = np.exp(-0.5 * ((at[:, None] - steps[known]) / sigma) ** 2) * weights[known]
+    total = kernel.sum(1)
+    with np.errstate(invalid="ignore"):
+        return np.where(total > 1e-12, kernel @ values[known] / total, np.nan)
+
+
+def draw_curves(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
+    """Success and return of greedy evaluations over environment steps and minutes, one line per learner: mean and range
+    over seeds; dotted, the success of no correction in the last evaluations. Below, where runs have a `progress.csv`,
+    what happened in training, smoothed as in the paper, before the raw values."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    groups = {group: members for group, members in grouped(runs).items() if group[:2] == (env, preset)}
+    evaluated = {group: some for group, members in groups.items() if (some := [m for m in members if m.curve])}
+    trained = {group: some for group, members in groups.items() if (some := [m for m in members if m.progress])}
+    rows = 2 if trained else 1
+    figure, axes = pyplot.subplots(rows, 3, figsize=(13, 0.6 + 3.6 * rows), layout="constrained", squeeze=False)
+    colours = _draw_evaluations(axes[0], evaluated)
+    if trained:
+        _draw_training(axes[1], trained, colours)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=2)
+    about = "greedy evaluation during training (mean and range over seeds; dotted: no correction)"
+    below = f"\nbelow: training, smoothed over {SIGMA / EPOCHS:.0%} of the budget" if trained else ""
+    figure.suptitle(f"{env}, preset {preset}: {about}{below}")
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def _draw_evaluations(axes: Any, groups: dict[Group, list[Run]]) -> dict[Group, Any]:
+    """Three axes of greedy evaluations; returns the colour of each group."""
+    colours: dict[Group, Any] = {}
+    by_steps, by_minutes = ("env_steps", 1e3), ("wall_seconds", SECONDS_PER_MINUTE)
+    views = ((*by_steps, "success_rate"), (*by_minutes, "success_rate"), (*by_steps, "return_mean"))
+    for axis, (x, unit, y) in zip(axes, views, strict=True):
+        for group, members in groups.items():
+            length = min(len(m.curve) for m in members)
+            values = [[m.curve[i][y] for m in members] for i in range(length)]
+            at = [mean(m.curve[i][x] for m in members) / unit for i in range(length)]
+            label = f"{group[2]}, guidance {group[3]}, {group[4]}k ({len(members)})"
+            colour = colours.get(group, COLOURS.get(group[2:4]))
+            (line,) = axis.plot(at, [mean(v) for v in values], color=colour, marker="o", markersize=3, label=label)
+            colour = colours[group] = line.get_color()
+            axis.fill_between(at, [min(v) for v in values], [max(v) for v in values], color=colour, alpha=0.15)
+            zero = [rate for rate, _ in zero_shares(members)]
+            if zero and y == "success_rate":
+                axis.axhline(mean(zero), color=colour, linestyle=":")
+        axis.set_xlabel("environment steps [1000]" if x == "env_steps" else "minutes")
+        axis.set_ylabel(y.replace("_", " "))
+        axis.grid(alpha=0.3)
+        if y == "success_rate":
+            axis.set_ylim(-0.02, 1.02)
+    return colours
+
+
+def _draw_training(axes: Any, groups: dict[Group, list[Run]], colours: dict[Group, Any]) -> None:
+    """Three axes of training: the mean over seeds of smoothed curves, before the raw values of each seed."""
+    for axis, (column, label) in zip(axes, TRAINING, strict=True):
+        for group, members in groups.items():
+            colour, curves = colours.get(group, COLOURS.get(group[2:4])), []
+            at = np.linspace(0, min(m.progress["env_steps"].max(initial=0.0) for m in members), GRID)
+            for m in members:
+                steps, values, episodes = (m.progress[name] for name in ("env_steps", column, "episodes"))
+                curves.append(smoothed(at, steps, values, episodes, m.budget * SIGMA / EPOCHS))
+                known = np.isfinite(values)
+                (line,) = axis.plot(steps[known] / 1e3, values[known], color=colour, alpha=0.15, linewidth=0.6)
+                colour = colours[group] = line.get_color()
+            axis.plot(at / 1e3, np.mean(curves, 0), color=colour)
+        axis.set_xlabel("environment steps [1000]")
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)

@@ -1,0 +1,103 @@
+"""Finished runs as they lie in folders, and which of them make one row of a report."""
+
+import csv
+import json
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from dora.agents.evaluation.evaluate import FINAL_SEED
+from dora.agents.runs.progress_table import read_progress
+from dora.errors import InputError
+
+CURVE_COLUMNS = ("env_steps", "wall_seconds", "success_rate", "return_mean", "penetration_p95_mm")
+"""Columns of a learning curve that a report reads."""
+DEFAULT_PRESET = "standard"
+"""Preset of a run of a Dora task that names none."""
+
+Group = tuple[str, str, str, str, int]
+"""Environment, preset, agent, guidance, steps in thousands (rounded): what the runs of one row of the table share."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One finished run: its `result.json`, the rows of its `curve.csv`, the columns of its `progress.csv`."""
+
+    folder: Path
+    result: dict[str, Any]
+    curve: list[dict[str, float]]
+    progress: dict[str, Float[np.ndarray, " rows"]] = field(default_factory=dict)
+
+    @property
+    def group(self) -> Group:
+        """Runs that differ only in their seed share it; guidance names its parts if the run did, and the agent
+        another reward than the usual one, and whether it was only evaluated."""
+        result = self.result
+        task = result if "preset" in result else result.get("task", {})
+        parts = task.get("guidance_parts")
+        guidance = result["guidance"] + (f" ({', '.join(parts)})" if parts else "")
+        agent = result["agent"].upper()
+        agent += ", paper's reward" if result.get("reward", "dense") == "paper" else ""
+        agent += ", evaluated again" if result.get("checkpoint") else ""
+        return result["env"], task.get("preset", DEFAULT_PRESET), agent, guidance, round(result["env_steps"] / 1000)
+
+    @property
+    def budget(self) -> int:
+        """Environment steps for which the run was meant."""
+        return self.result.get("total_steps", self.result["env_steps"])
+
+
+def find_runs(root: Path) -> list[Run]:
+    """All finished runs under `root`, by path; unfinished ones are left out.
+
+    Raises:
+        InputError: if there is none, or a result file is damaged.
+    """
+    runs = []
+    for path in sorted(root.rglob("result.json")):
+        try:
+            result = json.loads(path.read_text())
+        except json.JSONDecodeError as error:
+            raise InputError(f"{path} is damaged ({error}); repeat the run or remove its folder.") from error
+        curve, progress = path.with_name("curve.csv"), path.with_name("progress.csv")
+        if result.get("finished"):
+            rows = _rows(curve) if curve.exists() else []
+            runs.append(Run(path.parent, result, rows, read_progress(progress) if progress.exists() else {}))
+    if not runs:
+        raise InputError(f"there is no finished run under {root}: point at a folder with result.json files in it.")
+    return runs
+
+
+def _rows(path: Path) -> list[dict[str, float]]:
+    with path.open() as file:
+        return [{k: float(row[k]) for k in CURVE_COLUMNS} for row in csv.DictReader(file)]
+
+
+def grouped(runs: Sequence[Run]) -> dict[Group, list[Run]]:
+    """The runs of each row of a table, in its order."""
+    groups: dict[Group, list[Run]] = defaultdict(list)
+    for run in runs:
+        groups[run.group].append(run)
+    return dict(sorted(groups.items()))
+
+
+def success_shares(runs: Sequence[Run]) -> list[tuple[float, int]]:
+    """Success rate and episodes of each run; 0 episodes if it does not say how many."""
+    return [(r.result["success_rate"], r.result.get("eval_episodes", 0)) for r in runs]
+
+
+def zero_shares(runs: Sequence[Run]) -> list[tuple[float, int]]:
+    """The same of no correction in the runs that have a prior. Zero action on the same starts is the same episodes,
+    whatever was learned, so they count once."""
+    found: dict[tuple[Any, ...], tuple[float, int]] = {}
+    for run in runs:
+        r = run.result
+        if r["zero_success_rate"] is not None:
+            starts = r.get("first_seed", FINAL_SEED), r.get("eval_episodes", 0), r["zero_success_rate"]
+            found[starts] = r["zero_success_rate"], r.get("eval_episodes", 0)
+    return list(found.values())
