@@ -138,7 +138,7 @@ def _candidates(
     quality, predicted, closed = _quality(obj, model, rows, selected, num)
     order = quality.argsort(descending=True)
     best = order[faults[order].argsort(stable=True)][:num]
-    poses, joints, wrist = poses[best], rows.joints[best], rows.wrist[best]
+    joints, wrist = rows.joints[best], rows.wrist[best]
     closed_wrist, closed_joints = (part[best] for part in closed)
     points, finger = pressed_contacts(hand, energy.field, hand.forward(closed_wrist, closed_joints))
     regions = map_of(obj, str(points.device))
