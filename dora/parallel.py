@@ -32,6 +32,17 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch on one thread, as a context or a decorator; small tensors take longer on several, above all busy ones."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 class WorkerPool(Generic[Case, Result]):
     """A `ProcessPoolExecutor` whose processes each hold one task; a context manager.
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from random_hands import DOUBLE, draw
 
 from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.objects.signed_distance import SignedDistanceField
@@ -22,10 +23,9 @@ from dora.affordance.search.energies import (
 from dora.geometry.rotations import matrix_from_rotation_vector
 from dora.robot import load_robot
 
-COUNT, CONTACTS = 24, 8
+CONTACTS = 8
 STEP = 1e-6
 """Step of the finite differences (m or rad)."""
-DOUBLE = torch.float64
 STEADY = ("closure", "distance", "region", "closing", "limits")
 """Terms whose weight does not grow."""
 
@@ -41,19 +41,6 @@ def energy(hand) -> GraspEnergy:
     region = trimesh.Trimesh(box.vertices, box.faces[:2])
     field = SignedDistanceField(box, region, dtype=DOUBLE)
     return GraspEnergy(hand, field, table=Table((0.0, 0.6, 0.8), 0.01))
-
-
-def draw(hand: HandModel, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Wrists with the palm near the object's centre, joints up to a little beyond their limits, contacts."""
-    generator = torch.Generator().manual_seed(seed)
-    wrist = torch.eye(4, dtype=DOUBLE).repeat(COUNT, 1, 1)
-    turn = matrix_from_rotation_vector(2 * torch.randn(COUNT, 3, generator=generator, dtype=DOUBLE))
-    center = torch.tensor(hand.palm_frame.center + 0.04 * hand.palm_frame.normal)
-    wrist[:, :3, :3] = turn
-    wrist[:, :3, 3] = 0.03 * torch.randn(COUNT, 3, generator=generator, dtype=DOUBLE) - turn @ center
-    share = 1.1 * torch.rand(COUNT, len(hand.lower), generator=generator, dtype=DOUBLE) - 0.05
-    contacts = torch.randint(len(hand.contacts.body), (COUNT, CONTACTS), generator=generator)
-    return wrist, hand.lower + (hand.upper - hand.lower) * share, contacts
 
 
 def moved(wrist: torch.Tensor, move: torch.Tensor) -> torch.Tensor:

@@ -12,6 +12,7 @@ from dora.sim import can_render
 DEMO = Path(__file__).parent.parent / "examples" / "demo_robot.py"
 EXAMPLES = {
     "demo_robot": (["--help"], "--keyframe-actions"),  # it wants a screen: more of it is tried above
+    "own_energy": ([], "with weight 200 the energy is 0."),
     "third_party_task": ([], "4 of 4 palms came to their cubes"),
 }
 """Arguments of every example, and something that it prints."""

@@ -58,6 +58,7 @@ def script() -> ModuleType:
         ("--contact-maps", "need --object"),
         ("--contact-maps --object spoon", "no object 'spoon'"),
         ("--rank-in-task --mesh a.stl", "need --object"),
+        ("--make-bundle --object cube --kinematics pytorch_kinematics", "is for searches, not for --make-bundle"),
         ("--rank-in-task --object spoon", "no object 'spoon'"),
         ("--rank-in-task --object microwave", "no task uses the object 'microwave'"),
     ],
@@ -76,7 +77,7 @@ def test_bad_input(
     assert captured.out == ""
 
 
-@pytest.mark.parametrize("arguments", ["--validate isaac", "--ship", "--no-such-option 1"])
+@pytest.mark.parametrize("arguments", ["--validate isaac", "--kinematics newton", "--ship", "--no-such-option 1"])
 def test_errors_of_the_parser(script: ModuleType, monkeypatch: pytest.MonkeyPatch, arguments: str):
     with pytest.raises(SystemExit) as exit_info:
         call(script, monkeypatch, *arguments.split())
@@ -205,7 +206,7 @@ def test_searches_by_region_and_the_votes(
     bundled = GraspCandidates.load(bundled_path("jug"))
     asked = []
 
-    def search(obj, robot, num, seed, region, settings, progress) -> GraspCandidates:
+    def search(obj, robot, num, seed, region, settings, progress, kinematics) -> GraspCandidates:
         asked.append((region, num))
         return bundled.select(slice(num))
 

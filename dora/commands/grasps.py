@@ -19,6 +19,7 @@ from dora.affordance.contact_maps import map_bundled_set
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.importing import import_object
+from dora.affordance.search.backends import Kinematics
 from dora.errors import InputError
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
@@ -63,6 +64,8 @@ class Args:
     """Close the hand and pull along six directions in SAPIEN, or only measure penetration."""
     baselines: int = 64
     """Candidates of each baseline; 0 leaves the baselines out."""
+    kinematics: Kinematics = "compiled"
+    """Search in compiled loops, or by automatic differentiation through pytorch_kinematics (slower)."""
     by_region: int = 0
     """Candidates of a search for each other region and of a free one, simulated as well: how often each region is held
     with and without asking for it, and how well the vote tells (needs --validate sapien)."""
@@ -111,16 +114,18 @@ def run(args: Args) -> None:
     check_out(out)
     simulate = args.validate == "sapien"
     with ProgressDisplay() as phases:
-        generated = generate(obj, robot, args.num, args.seed, region, phases, simulate)
-        report = summary(generated)
+        generated = generate(obj, robot, args.num, args.seed, region, phases, simulate, kinematics=args.kinematics)
+        report = summary(generated) | {"kinematics": args.kinematics}
         searches = {}
         if args.by_region:
-            searches = by_region(obj, robot, args.by_region, args.seed, region, phases)
+            searches = by_region(obj, robot, args.by_region, args.seed, region, phases, args.kinematics)
             report["by_region"] = {name: summary(found) for name, found in searches.items()}
         if simulate:
             report["voting"] = voting_summary([generated, *searches.values()], obj)
         if args.baselines:
-            report["baselines"] = baselines(obj, robot, args.baselines, args.seed, region, phases, simulate)
+            report["baselines"] = baselines(
+                obj, robot, args.baselines, args.seed, region, phases, simulate, args.kinematics
+            )
     print_report(report)
     write_report(report, generated.candidates, out)
     print(out)
@@ -132,6 +137,8 @@ def remake(args: Args) -> None:
         raise InputError(
             "--make-bundle, --rank-in-task and --contact-maps need --object, for example --object jug, and no --mesh."
         )
+    if args.kinematics != "compiled":
+        raise InputError(f"--kinematics {args.kinematics} is for searches, not for --make-bundle or --rank-in-task.")
     name = args.object
     if args.contact_maps and not (args.make_bundle or args.rank_in_task):
         path, agreement = map_bundled_set(name)

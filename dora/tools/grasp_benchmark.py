@@ -12,12 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pytorch_kinematics
 import torch
 import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dora.affordance.hand.chain_hand import ChainHand
 from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.hand.postures import pregrasp, squeeze
 from dora.affordance.objects.affordance_object import AffordanceObject
@@ -32,6 +32,7 @@ from dora.affordance.search.native.parts import PARTS, repeat
 from dora.affordance.search.optimise import optimise, seated, table_of
 from dora.affordance.search.quasi_static_closing import close_hand
 from dora.affordance.search.search import Search, Settings
+from dora.parallel import one_thread
 from dora.robot import RobotDescription
 
 NUM = 256
@@ -96,23 +97,6 @@ class GraspBenchmark:
     search_candidates_per_second: float
 
 
-class PlainHand(HandModel):
-    """The hand with forward kinematics of pytorch_kinematics; coupled joints expanded."""
-
-    def __init__(self, robot: RobotDescription) -> None:
-        self._chain = pytorch_kinematics.build_chain_from_urdf(robot.urdf.read_bytes())
-        super().__init__(robot)
-
-    def forward(self, wrist: Float[Tensor, "c 4 4"], actuated: Float[Tensor, "c a"]) -> Float[Tensor, "c b 4 4"]:
-        """As `HandModel.forward`."""
-        full = self.robot.expand_hand(actuated)
-        angles = {name: full[:, index] for index, name in enumerate(self.robot.hand.names)}
-        angles |= {name: torch.zeros_like(full[:, 0]) for name in self.robot.arm.names}
-        found = self._chain.forward_kinematics(angles)
-        frames = torch.stack([found[link].get_matrix().expand(len(full), -1, -1) for link in self.links], 1)
-        return (wrist @ torch.linalg.inv(frames[:, 0])).unsqueeze(1) @ frames
-
-
 class PlainField(SignedDistanceField):
     """The object by trimesh's closest-point query; normals count as constant."""
 
@@ -145,12 +129,8 @@ def measure(name: str, robot: RobotDescription, settings: Settings | None = None
     Raises:
         InputError: there is no such object.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_thread():
         return _measure(load_object(name), robot, settings or Settings())
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _measure(obj: AffordanceObject, robot: RobotDescription, settings: Settings) -> GraspBenchmark:
@@ -193,7 +173,7 @@ def _search(obj: AffordanceObject, hand: HandModel, field: SignedDistanceField, 
 
 def _reference(obj: AffordanceObject, robot: RobotDescription, settings: Settings) -> float:
     """Seconds of an evaluation of one candidate with pytorch_kinematics and trimesh."""
-    hand = PlainHand(robot)
+    hand = ChainHand(robot)
     energy = GraspEnergy(hand, PlainField(obj.solid), settings.weights, table_of(obj))
     search = Search(energy, InitialPoses(obj, hand, obj.target, settings.spread), replace(settings, starts=1))
     return _evaluation(search, REFERENCE_ROWS, REFERENCE_REPEATS)

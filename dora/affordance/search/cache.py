@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+from dora.affordance.hand.chain_hand import ChainHand
 from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.maps.affordance_map import AffordanceMap
 from dora.affordance.objects.affordance_object import AffordanceObject
@@ -19,6 +20,12 @@ CACHE_SIZE = 4
 def hand_of(robot: RobotDescription, device: str) -> HandModel:
     """The hand of a robot on a torch device."""
     return HandModel(robot, device=device)
+
+
+@lru_cache(CACHE_SIZE)
+def chain_hand_of(robot: RobotDescription, device: str) -> ChainHand:
+    """The hand of a robot on a torch device, with kinematics of pytorch_kinematics."""
+    return ChainHand(robot, device=device)
 
 
 @lru_cache(CACHE_SIZE)
@@ -47,5 +54,5 @@ def map_of(obj: AffordanceObject, device: str) -> AffordanceMap:
 
 def forget() -> None:
     """Empty the cache."""
-    for kept in (hand_of, field_of, initial_of, map_of):
+    for kept in (hand_of, chain_hand_of, field_of, initial_of, map_of):
         kept.cache_clear()

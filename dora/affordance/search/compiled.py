@@ -35,19 +35,14 @@ class CompiledEnergy(GraspEnergy):
         )
         value = torch.from_numpy(terms).to(joints)
         gradients = torch.from_numpy(gradient).to(joints)
-        names = [
-            name
-            for name in TERMS
-            if (name != "region" or self._has_region) and (name != "table" or self.table is not None)
-        ]
         total = value @ value.new_tensor(weights)
         return Evaluation(
-            total, {name: value[:, TERMS.index(name)] for name in names}, gradients[:, :6], gradients[:, 6:]
+            total, {name: value[:, TERMS.index(name)] for name in self.names}, gradients[:, :6], gradients[:, 6:]
         )
 
     def factors(self, ramp: float) -> np.ndarray:
         """Weights (terms,) of all terms, those in `RAMPED` multiplied by `ramp`."""
-        return np.array([getattr(self.weights, name) * (ramp if name in RAMPED else 1.0) for name in TERMS])
+        return np.array(list(self.ramped_weights(ramp).values()))
 
     def plane(self) -> np.ndarray:
         """(4,) normal and offset [m] of the table in the object frame; an infinite offset if there is no table."""
@@ -73,11 +68,11 @@ class CompiledEnergy(GraspEnergy):
             "offset": hand.joint_offset,
             "lower": hand.joint_lower,
             "upper": hand.joint_upper,
-            "close": self._close,
+            "close": self.close,
             "contact_local": hand.contacts.local,
             "sphere_local": hand.spheres.local,
             "sphere_radius": hand.sphere_radius,
-            "sphere_reach": self._skin,
+            "sphere_reach": self.skin,
             "ends": hand.ends.local,
             "radius": hand.radius,
             "bound": self._bound[hand.pairs[:, 0], hand.pairs[:, 1]],

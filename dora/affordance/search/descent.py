@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dora.affordance.search.energies import RAMPED, Evaluation, GraspEnergy
+from dora.affordance.search.energies import RAMPED, GraspEnergy
 from dora.geometry.rotations import matrix_from_rotation_vector
 
 MEAN_DECAY, SQUARE_DECAY = 0.9, 0.98
@@ -52,6 +52,12 @@ class Rows:
         """The rows of an index or a mask."""
         return Rows(*(getattr(self, part.name)[index] for part in fields(self)))
 
+    def move(self, step: Float[Tensor, "c m"]) -> None:
+        """Move in place by translation [m], rotation vector in the object frame and change of the joints [rad]."""
+        self.wrist[:, :3, 3] += step[:, :3]
+        self.wrist[:, :3, :3] = matrix_from_rotation_vector(step[:, 3:6]) @ self.wrist[:, :3, :3]
+        self.joints += step[:, 6:]
+
     @staticmethod
     def join(parts: list[Rows]) -> Rows:
         """Rows of several parts, in their order."""
@@ -81,18 +87,15 @@ class Descent:
         """Move rows in place; `total` and `overlap` become the values before the last step."""
         for step, (ramp, size) in enumerate(zip(schedule.ramp, schedule.size, strict=True), schedule.before + 1):
             found = self.energy(rows.wrist, rows.joints, rows.contacts, ramp)
-            rows.total, rows.overlap = found.total, overlap(found)
+            rows.total, rows.overlap = found.total, overlap(found.terms)
             gradient = torch.cat((found.wrist, found.joints), 1)
             rows.mean.lerp_(gradient, 1 - MEAN_DECAY)
             rows.square.lerp_(gradient.square(), 1 - SQUARE_DECAY)
             mean = rows.mean / (1 - MEAN_DECAY**step)
             root = (rows.square / (1 - SQUARE_DECAY**step)).sqrt_().add_(ADAM_EPSILON)
-            move = -size * self.largest * mean / root
-            rows.wrist[:, :3, 3] += move[:, :3]
-            rows.wrist[:, :3, :3] = matrix_from_rotation_vector(move[:, 3:6]) @ rows.wrist[:, :3, :3]
-            rows.joints += move[:, 6:]
+            rows.move(-size * self.largest * mean / root)
 
 
-def overlap(found: Evaluation) -> Float[Tensor, " c"]:
+def overlap(terms: dict[str, Tensor]) -> Float[Tensor, " c"]:
     """Sum of the unweighted terms `RAMPED`, which must vanish in the end [m]."""
-    return torch.stack([found.terms[name] for name in RAMPED if name in found.terms]).sum(0)
+    return torch.stack([terms[name] for name in RAMPED if name in terms]).sum(0)

@@ -43,7 +43,7 @@ PRESS = 2e-3
 """Penetration depth that a contact point of the closed hand should reach [m]."""
 SKIN = 7e-4
 """Distance outside the surface from which overlap counts: the error of spheres and interpolation [m]."""
-_SMALLEST_LENGTH = 1e-9
+SMALLEST_LENGTH = 1e-9
 """Lower bound of a length by which a vector is divided [m]."""
 
 
@@ -105,6 +105,10 @@ class GraspEnergy:
         field: the object's distance field, with a region channel if a region is to be held.
         weights: weights of the terms; the defaults if None.
         table: the table on which the object rests; None if it is free.
+
+    Attributes:
+        close: (a,) change of the actuated joints that closes the hand for the term `closing` [rad].
+        skin: (s,) radii of the hand's spheres and the thickness `SKIN` [m].
     """
 
     def __init__(
@@ -118,8 +122,8 @@ class GraspEnergy:
         first, second = hand.pairs.unbind(1)
         self._bound[first, second] = (bound[first] + bound[second]).square()
         self._capsule_body = hand.ends.body[0::2]
-        self._skin = hand.sphere_radius + SKIN
-        self._close = hand.lower.new_tensor(CLOSING * STANDARD.squeeze * hand.robot.reduce_hand(flexion(hand.robot)))
+        self.skin = hand.sphere_radius + SKIN
+        self.close = hand.lower.new_tensor(CLOSING * STANDARD.squeeze * hand.robot.reduce_hand(flexion(hand.robot)))
         self._has_region = field.table.shape[1] > CHANNELS
 
     def __call__(
@@ -138,14 +142,14 @@ class GraspEnergy:
             ramp: factor on the weights of `RAMPED` [1].
         """
         poses = self.hand.forward(wrist, joints)
-        closed = self.hand.forward(wrist, joints + self._close)
+        closed = self.hand.forward(wrist, joints + self.close)
         found = self.contact_terms(poses, contacts)
         found |= self.sphere_terms(poses)
         found["self_penetration"] = self.self_penetration(poses)
         terms = {name: value for name, (value, _) in found.items()}
         terms["limits"], slope = self.limits(joints)
         terms["closing"], applied = self.closing(closed, contacts)
-        factor = {name: getattr(self.weights, name) * (ramp if name in RAMPED else 1.0) for name in TERMS}
+        factor = self.ramped_weights(ramp)
         forces = [applied._replace(force=factor[name] * applied.force) for name, (_, applied) in found.items()]
         wrench = assemble(len(wrist), poses.shape[1], forces)
         wrist_gradient, joint_gradient = self.hand.pull_back(poses, wrench)
@@ -154,6 +158,16 @@ class GraspEnergy:
         total = torch.stack([factor[name] * value for name, value in terms.items()]).sum(0)
         joint_gradient = joint_gradient + joint_closed + factor["limits"] * slope
         return Evaluation(total, terms, wrist_gradient + wrist_closed, joint_gradient)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the terms that this object has: `region` needs one to be held, `table` a table."""
+        lacks = {"region": not self._has_region, "table": self.table is None}
+        return [name for name in TERMS if not lacks.get(name, False)]
+
+    def ramped_weights(self, ramp: float) -> dict[str, float]:
+        """Weight of every one of `TERMS`, those in `RAMPED` multiplied by `ramp`."""
+        return {name: getattr(self.weights, name) * (ramp if name in RAMPED else 1.0) for name in TERMS}
 
     def weighted(self, weights: Weights) -> GraspEnergy:
         """The same energy with other weights."""
@@ -198,7 +212,7 @@ class GraspEnergy:
     def _closure(self, point: Tensor, value: Tensor, slope: Tensor, count: int, each: int) -> tuple[Tensor, Tensor]:
         """||G c||^2 (c,) and its derivative (c k, 3) with respect to the contact points."""
         raw = value[:, 1:CHANNELS]
-        length = raw.norm(dim=-1, keepdim=True).clamp_min(_SMALLEST_LENGTH)
+        length = raw.norm(dim=-1, keepdim=True).clamp_min(SMALLEST_LENGTH)
         inward = (-raw / length).view(count, each, 3)
         arm = (point / LENGTH).view(count, each, 3)
         force, torque = net_wrench(arm, inward)
@@ -214,10 +228,10 @@ class GraspEnergy:
         hand = self.hand
         centers = hand.place(poses, hand.spheres)
         terms = {}
-        touching = self.field.may_touch(centers, self._skin)
+        touching = self.field.may_touch(centers, self.skin)
         points = centers.view(-1, 3)[touching]
         value, slope = self.field.sample(points, 1)
-        depth = self._skin[touching % len(self._skin)] - value[:, 0]
+        depth = self.skin[touching % len(self.skin)] - value[:, 0]
         terms["penetration"] = self._overlap(touching, points, depth, -slope[:, 0], len(poses))
         if self.table is not None:
             normal = centers.new_tensor(self.table.normal)
@@ -242,7 +256,7 @@ class GraspEnergy:
         overlap = -gap.clamp_max(0)
         value = overlap.new_zeros(len(poses)).index_add_(0, row, overlap)
         away = first - second
-        force = -away / away.norm(dim=-1, keepdim=True).clamp_min(_SMALLEST_LENGTH) * (gap < 0).unsqueeze(1)
+        force = -away / away.norm(dim=-1, keepdim=True).clamp_min(SMALLEST_LENGTH) * (gap < 0).unsqueeze(1)
         body = self._capsule_body[pair].flatten()
         return value, PointForces(row.repeat(2), body, torch.cat((first, second)), torch.cat((force, -force)))
 
@@ -295,13 +309,20 @@ def segment_points(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Nearest points of segments a0 a1 and b0 b1, whose lengths may be zero.
 
-    As in C. Ericson, Real-Time Collision Detection, 2004, section 5.1.9.
+    As in C. Ericson, Real-Time Collision Detection, 2004, section 5.1.9. For automatic differentiation the points are
+    fixed to their segments: the derivative of the distance with respect to their places along these is zero.
     """
+    with torch.no_grad():
+        s, t = _segment_shares(a0, a1, b0, b1)
+    return a0 + s.unsqueeze(-1) * (a1 - a0), b0 + t.unsqueeze(-1) * (b1 - b0)
+
+
+def _segment_shares(a0: Tensor, a1: Tensor, b0: Tensor, b1: Tensor) -> tuple[Tensor, Tensor]:
+    """Places (n,) of the nearest points along segments a0 a1 and b0 b1, from 0 to 1."""
     u, v, w = a1 - a0, b1 - b0, a0 - b0
     uu, vv, uv = (u * u).sum(-1), (v * v).sum(-1), (u * v).sum(-1)
     uw, vw = (u * w).sum(-1), (v * w).sum(-1)
     tiny = torch.finfo(a0.dtype).tiny
-    s = ((uv * vw - uw * vv) / (uu * vv - uv * uv).clamp_min(_SMALLEST_LENGTH**2)).clamp(0, 1)
+    s = ((uv * vw - uw * vv) / (uu * vv - uv * uv).clamp_min(SMALLEST_LENGTH**2)).clamp(0, 1)
     t = ((uv * s + vw) / vv.clamp_min(tiny)).clamp(0, 1)
-    s = ((uv * t - uw) / uu.clamp_min(tiny)).clamp(0, 1)
-    return a0 + s.unsqueeze(-1) * u, b0 + t.unsqueeze(-1) * v
+    return ((uv * t - uw) / uu.clamp_min(tiny)).clamp(0, 1), t

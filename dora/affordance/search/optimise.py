@@ -14,16 +14,18 @@ from torch import Tensor
 from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.hand.grasp_test_settings import STANDARD
 from dora.affordance.hand.postures import pregrasp, squeeze
-from dora.affordance.maps.contact_semantic_map import contact_semantic_map, hand_contacts, pressed_contacts
+from dora.affordance.maps.contact_semantic_map import contact_semantic_map, pressed_contacts
 from dora.affordance.maps.voting import NO_CONTACT, vote
 from dora.affordance.objects.affordance_object import AffordanceObject
-from dora.affordance.search.cache import field_of, hand_of, initial_of, map_of
+from dora.affordance.search.backends import check_kinematics, closing_model_of, described, energy_of
+from dora.affordance.search.cache import initial_of, map_of
 from dora.affordance.search.compiled import CompiledEnergy
 from dora.affordance.search.descent import Rows
 from dora.affordance.search.energies import GraspEnergy, Table
 from dora.affordance.search.penetration import Penetration, self_penetration
 from dora.affordance.search.quasi_static_closing import Steps, close_hand
 from dora.affordance.search.search import Search, Settings
+from dora.affordance.search.torch_energies import ExtraEnergies
 from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from dora.robot import RobotDescription
@@ -53,6 +55,8 @@ def optimise(
     settings: Settings | None = None,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
+    kinematics: str = "compiled",
+    extra_energies: ExtraEnergies | None = None,
 ) -> GraspCandidates:
     """Search for grasps of an object.
 
@@ -63,24 +67,30 @@ def optimise(
         seed: seed of all random draws; equal seeds give equal candidates.
         region: label of the region to be held; None for any.
         settings: settings of the search; the defaults if None.
-        device: torch device of the search and of the result.
+        device: torch device of the search and of the result; hands are closed on the CPU.
         progress: called with the candidate-iterations done and their total.
+        kinematics: one of `Kinematics`: "compiled" loops with gradients by hand, or "pytorch_kinematics" with automatic
+            differentiation, which is slower and takes energies of yours.
+        extra_energies: energies to be added to the terms: by name a constant weight, per unit of the energy, and a
+            differentiable function of `GraspState` whose value is (c,).
 
     Returns:
         `num` candidates in the object frame, best first. `valid` says whether the penetration depth at the candidate
         is within the grasp test's limit; whether the grasp withstands the test is decided by simulation.
 
     Raises:
-        InputError: `num` is less than 1, the object has no such region, or it is too large for a hand.
+        InputError: `num` is less than 1, the object has no such region or is too large for a hand, unknown kinematics,
+            or extra energies that cannot be used.
     """
     settings = settings or Settings()
     if num < 1:
         raise InputError(f"the search makes at least 1 candidate, not {num}.")
+    check_kinematics(kinematics, extra_energies)
     place = str(torch.device(device))
-    hand, field = hand_of(robot, place), field_of(obj, region, place)
     on_table = obj.on_table if settings.table is None else settings.table
-    kind = CompiledEnergy if hand.device.type == "cpu" else GraspEnergy
-    energy = kind(hand, field, settings.weights, table_of(obj) if on_table else None)
+    table = table_of(obj) if on_table else None
+    energy = energy_of(kinematics, obj, robot, region, place, settings.weights, table, extra_energies)
+    model = closing_model_of(energy, obj, robot, region)
     search = Search(energy, initial_of(obj, robot, region, settings.spread, place), settings)
     wanted = math.ceil(num * settings.oversampling)
     sizes = [min(settings.batch, wanted - start) for start in range(0, wanted, settings.batch)]
@@ -94,12 +104,13 @@ def optimise(
 
     def batch(size: int, index: int) -> Rows:
         rows = search.run(size, torch.Generator().manual_seed(batch_seed(seed, index)), report)
-        if settings.seat and isinstance(energy, CompiledEnergy):
-            rows = search.polish(seated(energy, rows, obj.mass, settings.seat), settings.polish)
+        if settings.seat:
+            rows = search.polish(seated(model, rows, obj.mass, settings.seat), settings.polish)
         return rows
 
     found = [batch(size, index) for index, size in enumerate(sizes)]
-    return _candidates(obj, energy, Rows.join(found), num, settings)
+    candidates = _candidates(obj, energy, model, Rows.join(found), num, settings)
+    return replace(candidates, settings=candidates.settings + described(kinematics, extra_energies))
 
 
 def batch_seed(seed: int, index: int) -> int:
@@ -114,9 +125,9 @@ def table_of(obj: AffordanceObject) -> Table:
 
 
 def _candidates(
-    obj: AffordanceObject, energy: GraspEnergy, rows: Rows, num: int, settings: Settings
+    obj: AffordanceObject, energy: GraspEnergy, model: CompiledEnergy, rows: Rows, num: int, settings: Settings
 ) -> GraspCandidates:
-    """The `num` best rows as candidates: fewest faults first, then highest quality."""
+    """The `num` best rows as candidates: fewest faults first, then highest quality; `model` closes hands."""
     hand, robot = energy.hand, energy.hand.robot
     found = energy(rows.wrist, rows.joints, rows.contacts, settings.ramp)
     poses = hand.forward(rows.wrist, rows.joints)
@@ -124,14 +135,12 @@ def _candidates(
     faults = 4 * (depth > STANDARD.penetration).long() + 2 * (self_depth > STANDARD.strict_self_penetration).long()
     faults += (depth > SHALLOW_PENETRATION).long()
     selected = faults.argsort(stable=True)[: _selected_count(faults, num)]
-    quality, predicted, closed = _quality(obj, energy, rows, found.total, selected, num)
+    quality, predicted, closed = _quality(obj, model, rows, selected, num)
     order = quality.argsort(descending=True)
     best = order[faults[order].argsort(stable=True)][:num]
-    poses, joints, wrist = poses[best], rows.joints[best], rows.wrist[best]
-    if closed is None:
-        points, finger = hand_contacts(hand, energy.field, poses)
-    else:
-        points, finger = pressed_contacts(hand, energy.field, closed[best])
+    joints, wrist = rows.joints[best], rows.wrist[best]
+    closed_wrist, closed_joints = (part[best] for part in closed)
+    points, finger = pressed_contacts(hand, energy.field, hand.forward(closed_wrist, closed_joints))
     regions = map_of(obj, str(points.device))
     voted = vote(regions, points, finger)
     position, quaternion = wrist[:, :3, 3].contiguous(), quaternion_from_matrix(wrist[:, :3, :3])
@@ -166,33 +175,30 @@ def _selected_count(faults: Tensor, num: int) -> int:
 
 
 def _quality(
-    obj: AffordanceObject, energy: GraspEnergy, rows: Rows, total: Tensor, selected: Tensor, num: int
-) -> tuple[Tensor, dict[str, Tensor], Tensor | None]:
+    obj: AffordanceObject, model: CompiledEnergy, rows: Rows, selected: Tensor, num: int
+) -> tuple[Tensor, dict[str, Tensor], tuple[Tensor, Tensor]]:
     """Quality (c,) of the selected rows, of which the `num` best must be exact; others have -inf.
 
     Returns:
-        Quality, more is better; the model's predictions (c,) by name, nan for other rows; and poses (c, b, 4, 4) of
-        the closed hand in the object frame, None where the energy is not compiled and -E is the quality.
+        Quality, more is better; the model's predictions (c,) by name, nan for other rows; and the closed hand's wrist
+        (c, 4, 4) in the object frame and actuated joints (c, a) [rad].
     """
-    if not isinstance(energy, CompiledEnergy):
-        return -total, {}, None
-    robot = energy.hand.robot
+    robot = model.hand.robot
     full = robot.expand_hand(rows.joints[selected])
     closed_hand = close_hand(
-        energy, rows.wrist[selected], pregrasp(robot, full), squeeze(robot, full), obj.mass, wanted=num
+        model, rows.wrist[selected], pregrasp(robot, full), squeeze(robot, full), obj.mass, wanted=num
     )
 
     def spread(values: Tensor, missing: float) -> Tensor:
-        return torch.full_like(total, missing).index_copy_(0, selected, values)
+        return values.new_full((len(rows), *values.shape[1:]), missing).index_copy_(0, selected, values)
 
     predictions = {
         "predicted_shift": spread(closed_hand.shift, math.nan),
         "predicted_displacement": spread(closed_hand.displacement[:, -1], math.nan),
         "predicted_force": spread(closed_hand.force, math.nan),
     }
-    closed = energy.hand.forward(closed_hand.wrist, robot.reduce_hand(closed_hand.joints))
-    poses = closed.new_full((len(total), *closed.shape[1:]), math.nan).index_copy_(0, selected, closed)
-    return spread(closed_hand.quality, -math.inf), predictions, poses
+    closed = spread(closed_hand.wrist, math.nan), spread(robot.reduce_hand(closed_hand.joints), math.nan)
+    return spread(closed_hand.quality, -math.inf), predictions, closed
 
 
 def seated(energy: CompiledEnergy, rows: Rows, mass: float, squeezed: float) -> Rows:

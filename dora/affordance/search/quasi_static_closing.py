@@ -103,8 +103,8 @@ def close_hand(
     plane = energy.plane() if on_table else np.array([0.0, 0.0, 0.0, np.inf])
     model = Model(free, energy.field_arrays, drives, center, float(test_settings.friction), plane)
     load = WEIGHT_FACTOR * mass * test_settings.gravity
-    end, final = wrist.double().numpy().copy(), opened[:, order].double().numpy()
-    command = squeezed[:, order].double().numpy()
+    end, final = wrist.double().cpu().numpy().copy(), opened[:, order].double().cpu().numpy()
+    command = squeezed[:, order].double().cpu().numpy()
     quality = QualitySettings(DISPLACEMENT_SCALE, SHIFT_SHARE, max(1, min(len(end), wanted or len(end))))
     result = close_and_load(model, steps, quality, load, np.array(DIRECTIONS), end, final, command)
     found = torch.from_numpy(result).to(wrist)

@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from dora.affordance.search.compiled import CompiledDescent, CompiledEnergy
-from dora.affordance.search.descent import Descent, Rows, Schedule
+from dora.affordance.search.backends import descent_of
+from dora.affordance.search.descent import Rows, Schedule
 from dora.affordance.search.energies import GraspEnergy, Weights
 from dora.affordance.search.initial_poses import InitialPoses, Spread
 from dora.errors import InputError
@@ -110,7 +110,7 @@ class Search:
         self.energy, self.initial, self.settings = energy, initial, settings
         hand = energy.hand
         steps = [settings.translation] * 3 + [settings.rotation] * 3 + [settings.joint] * len(hand.lower)
-        kind = CompiledDescent if isinstance(energy, CompiledEnergy) else Descent
+        kind = descent_of(energy)
         self.descent = kind(energy, hand.lower.new_tensor(steps))
         self.polishing = kind(energy.weighted(settings.polish_weights), hand.lower.new_tensor(steps))
         parts = hand.contact_part.unique().tolist()

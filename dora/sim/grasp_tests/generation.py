@@ -87,6 +87,7 @@ def generate(
     settings: Settings | None = None,
     test_settings: GraspTestSettings = STANDARD,
     name: str = "grasps",
+    kinematics: str = "compiled",
 ) -> Generated:
     """Search for grasps and validate them.
 
@@ -101,16 +102,18 @@ def generate(
         settings: settings of the search; the defaults if None.
         test_settings: settings of the grasp test.
         name: name of this run in the progress display.
+        kinematics: kinematics and gradients of the search, as for `optimise`.
 
     Raises:
-        InputError: `num` is less than 1, or the object has no such region or does not suit the hand.
+        InputError: `num` is less than 1, or the object has no such region or does not suit the hand, or kinematics are
+            unknown.
     """
     settings = settings or Settings()
     start = time.perf_counter()
     if simulate:
         warm_up(ShakeTest)
     report = phases.phase(f"{name}: search", "candidates", scale=1 / settings.iterations)
-    found = optimise(obj, robot, num, seed, region, settings, progress=report)
+    found = optimise(obj, robot, num, seed, region, settings, progress=report, kinematics=kinematics)
     between = time.perf_counter()
     verdict, voting = None, {}
     if simulate:
@@ -166,16 +169,25 @@ def baselines(
     region: str | None,
     phases: ProgressDisplay,
     simulate: bool = True,
+    kinematics: str = "compiled",
 ) -> dict[str, dict[str, Any]]:
     """Summaries of searches with the settings in `BASELINES`, by name; arguments as for `generate`."""
     return {
-        name: summary(generate(obj, robot, num, seed, region, phases, simulate, settings, name=name))
+        name: summary(
+            generate(obj, robot, num, seed, region, phases, simulate, settings, name=name, kinematics=kinematics)
+        )
         for name, settings in BASELINES.items()
     }
 
 
 def by_region(
-    obj: AffordanceObject, robot: RobotDescription, num: int, seed: int, region: str | None, phases: ProgressDisplay
+    obj: AffordanceObject,
+    robot: RobotDescription,
+    num: int,
+    seed: int,
+    region: str | None,
+    phases: ProgressDisplay,
+    kinematics: str = "compiled",
 ) -> dict[str, Generated]:
     """Validated grasps of a search without a region ("any") and of one for each region other than `region`, by name.
 
@@ -183,7 +195,7 @@ def by_region(
     """
     others = {FREE: None} | {label: label for label in obj.labels}
     return {
-        name: generate(obj, robot, num, seed, label, phases, name=name)
+        name: generate(obj, robot, num, seed, label, phases, name=name, kinematics=kinematics)
         for name, label in others.items()
         if label != region
     }
