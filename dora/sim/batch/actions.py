@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
+from jaxtyping import Float
 
 from dora.errors import InputError
 
@@ -59,3 +60,16 @@ def _check_finite(action: Any, whose: str) -> None:
     finite = action.isfinite() if isinstance(action, torch.Tensor) else np.isfinite(action)
     if not finite.all():
         raise InputError(f"The action{whose} contains NaN or infinity: all its numbers must be finite.")
+
+
+def checked_action(action: Any, space: Any, num_envs: int, device: torch.device) -> Float[torch.Tensor, "n a"] | None:
+    """An action, anything a tensor can be made of, as an (n, a) tensor without gradient; None stays None.
+
+    Raises:
+        InputError: as `check_array`.
+    """
+    if action is None:
+        return None
+    out = torch.as_tensor(action, dtype=torch.float32, device=device).detach()
+    check_array(out, space, num_envs)
+    return out.reshape(num_envs, -1)

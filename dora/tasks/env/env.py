@@ -21,7 +21,7 @@ from torch import Tensor
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.reach.feasibility_table import ReachTable
 from dora.errors import InputError
-from dora.sim.batch.actions import check_array
+from dora.sim.batch.actions import checked_action
 from dora.tasks.env.arm import Arm
 from dora.tasks.env.arm_group import ArmGroup
 from dora.tasks.env.description import describe
@@ -267,7 +267,8 @@ class DoraEnv(BaseEnv):
         return super().step(action)
 
     def _step_action(self, action: Any) -> Any:
-        action, step = self._checked(action), self._elapsed_steps
+        action = checked_action(action, self.single_action_space, self.num_envs, self.device)
+        step = self._elapsed_steps
         self.task.remember(self.snapshot)
         command = None
         if action is not None:
@@ -287,14 +288,6 @@ class DoraEnv(BaseEnv):
         self._snapshot = advanced(s, stage, phases)
         self._observed = self._snapshot if observed is s else advanced(observed, stage, phases)
         return action
-
-    def _checked(self, action: Any) -> Tensor | None:
-        """The action as an (n, a) tensor; InputError for a wrong shape or a value that is not finite."""
-        if action is None:
-            return None
-        out = torch.as_tensor(action, dtype=torch.float32, device=self.device)
-        check_array(out, self.single_action_space, self.num_envs)
-        return out.reshape(self.num_envs, self.action_size)
 
     def scripted_action(self) -> Float[Tensor, "n a"]:
         """Action that executes the chosen candidates from the present state: the scripted solution."""
@@ -334,7 +327,8 @@ class DoraEnv(BaseEnv):
         info.update({f"reward/{name}": weight * value for name, value in parts.items()})
         return weight * total
 
-    def compute_normalized_dense_reward(self, obs: Any, action: Any, info: dict) -> Tensor:  # noqa: D102
+    def compute_normalized_dense_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
+        """The dense reward over its largest possible value."""
         return self.compute_dense_reward(obs, action, info) / self.terms.upper
 
     def get_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
