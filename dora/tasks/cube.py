@@ -14,7 +14,7 @@ from mani_skill.utils.structs import Actor, Pose
 from sapien.physx import PhysxMaterial
 from torch import Tensor
 
-from dora.affordance.bundled_sets import load_candidates
+from dora.affordance.bundled_sets import best_candidates
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import load_object
@@ -87,6 +87,10 @@ class CubeConfig(TaskConfig):
     """Overlap that costs no reward [m]."""
     penetration_limit: float = 0.003
     """Largest overlap in an episode that counts as a success [m]."""
+    fewest_lifts: float = 0.2
+    """Share of executed lifts that a ranked candidate must have survived to be used [1]."""
+    most_candidates: int = 40
+    """Stored candidates that the task works with [1]."""
     weights: CubeWeights = field(default_factory=CubeWeights)
     """Weights of the reward terms."""
 
@@ -126,7 +130,7 @@ class CubeTask(Task):
         return Mdp(stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS)
 
     def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
-        return hand_made_candidates() if region else load_candidates("cube", region=False)
+        return best_candidates("cube", CLASS, self.config.fewest_lifts, self.config.most_candidates, region)
 
     def start_grid(self, arm: str) -> Grid:
         return Grid(self.config.centre, (self.config.spread,) * 2)
@@ -163,6 +167,8 @@ OBSERVATIONS: dict[str, Entry] = {
 """What the task observes beyond the common entries."""
 
 
+CLASS = "BodyGrasp"
+"""The grasp class of all candidates: the cube has one region."""
 REACH, GRASP, LIFT = range(3)
 """Indices of the stages."""
 RED = (0.85, 0.25, 0.15, 1.0)

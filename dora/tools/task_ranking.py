@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -213,10 +214,19 @@ def rank_bundled_set(name: str | Path, phase: Callable[[str], Callable[[int, int
     tested = concatenate([best, replace(rest, score=rest.score.clamp(max=float(best.score.min())))])
     others = [found.select(~wanted)] if not wanted.all() else []
     path = bundled_path(name, region)
-    settings = json.loads(found.settings or "{}") | {"ranking_steps": first.steps + again.steps}
+    settings = _as_mapping(found.settings) | {"ranking_steps": first.steps + again.steps}
     replace(concatenate([tested, *others]), settings=json.dumps(settings)).save(path)
     bundle_feasibility_tables(name)
     return path
+
+
+def _as_mapping(settings: str) -> dict[str, Any]:
+    """Settings of candidates by name; those of early files are the search's alone."""
+    try:
+        made = json.loads(settings or "{}")
+    except ValueError:
+        made = None
+    return made if isinstance(made, dict) else {"search": settings}
 
 
 def bundle_feasibility_tables(name: str | Path) -> list[Path]:

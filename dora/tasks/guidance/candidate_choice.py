@@ -34,7 +34,8 @@ class CandidateChoice:
         error_scale: share of the randomisation's candidate error in force, for curricula.
         error_draws: random numbers of an environment's error: 3 position, 3 rotation, one per hand joint.
         buffers: `position` (n, k, 3) [m], `quaternion` (n, k, 4), of the k nearest; of the first one `approach`
-            (n, 3), `pregrasp` and `grasp` (n, hand) [rad]; `reachable` (n,), 0 where no candidate can be reached.
+            (n, 3), `pregrasp` and `grasp` (n, hand) [rad]; `reachable` (n,), 0 where no candidate can be reached; `chosen`
+            (n,), index of the first candidate.
     """
 
     def __init__(self, candidates: GraspCandidates, num_envs: int, device: torch.device):
@@ -45,7 +46,7 @@ class CandidateChoice:
         self.error_draws = 6 + hand
         self.buffers = Buffers(
             num_envs, device, position=(NEAREST, 3), quaternion=(NEAREST, 4), approach=(3,), pregrasp=(hand,),
-            grasp=(hand,), reachable=(),
+            grasp=(hand,), reachable=(), chosen=(),
         )  # fmt: skip
         self.buffers.quaternion[..., 0] = 1.0
 
@@ -90,6 +91,7 @@ class CandidateChoice:
             pregrasp=c.pregrasp[first] + bend,
             grasp=c.grasp[first] + bend,
             reachable=reachable.float(),
+            chosen=first.float(),
         )
 
     def goals(

@@ -1,0 +1,90 @@
+"""The ladder of guidance: what each step takes away, what stays the same, and whether the reach filter pays."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import dora.tasks as tasks
+from dora.affordance.bundled_sets import load_candidates
+from dora.tasks.mdp.guidance_parts import PARTS
+from dora.tools.filter_benchmark import outcomes
+
+
+@pytest.mark.parametrize("env_id", ["DoraCube-v1", "DoraJug-v1", "DoraHammer-v1"])
+def test_grasps_take_away_the_regions_and_nothing_else(env_id: str):
+    whole, grasps, plain = (tasks.make_task(env_id, 4, guidance=g) for g in ("affordance", "grasps", "none"))
+    regional = {k for k, e in whole.observation_entries.items() if e.region}
+    assert regional
+    assert set(whole.observation_entries) - set(grasps.observation_entries) == regional
+    assert set(whole.terms.terms) - set(grasps.terms.terms) == {k for k, t in whole.terms.terms.items() if t.region}
+    assert "affordance" not in grasps.terms.terms
+    assert "candidate" in grasps.terms.terms
+    assert grasps.arm.takes_residual
+    assert grasps.action_size == whole.action_size
+    assert set(plain.terms.terms) < set(grasps.terms.terms)
+    for task in (whole, grasps, plain):
+        task.reset(seed=11)
+    for other in (grasps, plain):
+        torch.testing.assert_close(whole.snapshot.object.p, other.snapshot.object.p, atol=0, rtol=0)
+        torch.testing.assert_close(whole.snapshot.object.q, other.snapshot.object.q, atol=0, rtol=0)
+    mine, blind = (t.guide.choice.candidates for t in (whole, grasps))
+    assert mine.position.shape != blind.position.shape or not torch.equal(mine.position, blind.position)
+    assert mine.ranking_steps == blind.ranking_steps == whole.ranking_steps
+    for task in (whole, grasps, plain):
+        task.close()
+
+
+def test_the_class_of_the_grasp_belongs_to_the_task_of_the_jug():
+    task = tasks.make_task("DoraJug-v1", 2, guidance="none")
+    assert "class" in task.terms.terms
+    task.close()
+
+
+def test_candidates_of_a_blind_search_may_be_of_any_class():
+    assert len(set(load_candidates("jug", region=False).grasp_class)) > 1
+
+
+def test_a_start_without_a_reachable_candidate_fails_at_once_and_earns_nothing(monkeypatch: pytest.MonkeyPatch):
+    task = tasks.make_task("DoraCube-v1", 2, preset="none")
+    able = task.task.reachable
+
+    def none_for_the_second(arm: Any, p: Tensor, q: Tensor) -> Tensor:
+        return able(arm, p, q) & torch.tensor([[True], [False]])
+
+    monkeypatch.setattr(task.task, "reachable", none_for_the_second)
+    task.reset(seed=0)
+    _, reward, _, _, info = task.step(torch.zeros(2, task.action_size))
+    assert info["unreachable"].tolist() == info["fail"].tolist() == [False, True]
+    assert reward[0] > 0
+    assert reward[1] == 0
+    task.close()
+
+
+def test_the_filter_leaves_only_what_it_accepts(monkeypatch: pytest.MonkeyPatch):
+    """Every second candidate is out of reach: with the filter none of them leads, without it some do."""
+    parts = tuple(p for p in PARTS if p != "filter")
+    even = {}
+    for name, given in (("filtered", None), ("free", parts)):
+        task = tasks.make_task("DoraJug-v1", 64, guidance_parts=given)
+
+        def every_second(arm: Any, p: Tensor, q: Tensor) -> Tensor:
+            mask = torch.zeros(len(p), len(arm.guide.choice.candidates), dtype=torch.bool)
+            mask[:, ::2] = True
+            return mask
+
+        monkeypatch.setattr(task.task, "reachable", every_second)
+        task.reset(seed=0)
+        even[name] = (task.guide.choice.buffers.chosen % 2 == 0).float().mean().item()
+        task.close()
+    assert even["filtered"] == 1.0
+    assert even["free"] < 0.9
+
+
+def test_what_f_reach_rejects_fails_more_than_twice_as_often():
+    found = outcomes("DoraJug-v1", 64, "none", "random")
+    accepted, rejected = found.failure_rates()
+    print(f"accepted candidates fail in {accepted:.2f}, rejected ones in {rejected:.2f}")
+    assert rejected > 2 * accepted
+    assert rejected > 0.5
