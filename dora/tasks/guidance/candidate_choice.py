@@ -34,8 +34,8 @@ class CandidateChoice:
         error_scale: share of the randomisation's candidate error in force, for curricula.
         error_draws: random numbers of an environment's error: 3 position, 3 rotation, one per hand joint.
         buffers: `position` (n, k, 3) [m], `quaternion` (n, k, 4), of the k nearest; of the first one `approach`
-            (n, 3), `pregrasp` and `grasp` (n, hand) [rad]; `reachable` (n,), 0 where no candidate can be reached; `chosen`
-            (n,), index of the first candidate.
+            (n, 3), `pregrasp` and `grasp` (n, hand) [rad], and its index `chosen` (n,); `reachable` (n,), 0 where no
+            candidate can be reached.
     """
 
     def __init__(self, candidates: GraspCandidates, num_envs: int, device: torch.device):
