@@ -43,13 +43,14 @@ def best_candidates(
     Args:
         name: of an object or its folder, as for `load_object`.
         grasp_class: such as "HandleGrasp".
-        least: smallest score (share of executions that succeeded); candidates without one are left out.
+        least: smallest score (share of executions that succeeded), as a share of the best one's; candidates without a
+            score are left out.
         most: largest number of candidates.
         region: as for `bundled_path`; without it candidates of all classes are taken.
     """
     found = load_candidates(name, region=region)
-    wanted = found.score >= least
-    return found.select(wanted & found.of_class(grasp_class) if region else wanted).select(slice(most))
+    found = found.select(found.of_class(grasp_class)) if region else found
+    return found.select(found.score >= least * found.score.nan_to_num(nan=0.0).max()).select(slice(most))
 
 
 def load_candidates(name: str | Path, robot: RobotDescription | None = None, region: bool = True) -> GraspCandidates:

@@ -87,8 +87,11 @@ class CubeConfig(TaskConfig):
     """Overlap that costs no reward [m]."""
     penetration_limit: float = 0.003
     """Largest overlap in an episode that counts as a success [m]."""
-    fewest_lifts: float = 0.2
-    """Share of executed lifts that a ranked candidate must have survived to be used [1]."""
+    optimised: bool = False
+    """Use the candidates that the optimiser found in place of one made by hand; `guidance="grasps"` always does."""
+    fewest_lifts: float = 0.4
+    """Smallest share of its executions that a ranked candidate must have survived to be used, as a share of the best
+    candidate's [1]."""
     most_candidates: int = 40
     """Stored candidates that the task works with [1]."""
     weights: CubeWeights = field(default_factory=CubeWeights)
@@ -130,7 +133,10 @@ class CubeTask(Task):
         return Mdp(stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS)
 
     def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
-        return best_candidates("cube", CLASS, self.config.fewest_lifts, self.config.most_candidates, region)
+        c: CubeConfig = self.config
+        if region and not c.optimised:
+            return hand_made_candidates()
+        return best_candidates("cube", CLASS, c.fewest_lifts, c.most_candidates, region)
 
     def start_grid(self, arm: str) -> Grid:
         return Grid(self.config.centre, (self.config.spread,) * 2)
@@ -277,7 +283,7 @@ THUMB_ABDUCTION = -0.003
 def hand_made_candidates(name: str = "cube") -> GraspCandidates:
     """One top grasp made by hand, turned by quarter turns about the vertical: the cube looks the same after each.
 
-    The learner does better with it than with the stored set so far (docs/findings.md).
+    The learner does better with it than with the stored set (docs/tasks/cube.md).
     """
     position, quaternion = [], []
     level = torch.tensor([cos(pi / 4), 0.0, sin(pi / 4), 0.0])

@@ -125,8 +125,9 @@ class HammerConfig(TaskConfig):
     """Share of what blows earn that is left once an overlap was above the limit [1]."""
     swing_radius: float = 0.36
     """Distance of the swing's axis from the nail [m]."""
-    fewest_catches: float = 0.5
-    """Share of executed episodes that a ranked candidate must have survived to be used [1]."""
+    fewest_catches: float = 0.55
+    """Smallest share of its executions that a ranked candidate must have survived to be used, as a share of the best
+    candidate's [1]."""
     most_candidates: int = 24
     """Stored candidates that the task works with [1]."""
     nail: NailSettings = field(default_factory=NailSettings)
