@@ -38,9 +38,10 @@ def test_lifting_pays_until_the_target_height_and_more_with_an_opposed_grasp():
     p = torch.zeros(4, 3)
     p[:, 2] = rise
     touch = torch.zeros(4, 6, dtype=torch.bool)
-    loose = TERMS["lift"].value(invented(4, object_p=p))
+    lifting = torch.full((4,), cube.LIFT)
+    loose = TERMS["lift"].value(invented(4, object_p=p, stage=lifting))
     touch[:, :2] = True
-    firm = TERMS["lift"].value(invented(4, object_p=p, touch=touch))
+    firm = TERMS["lift"].value(invented(4, object_p=p, touch=touch, stage=lifting))
     torch.testing.assert_close(firm, torch.tensor([0.0, 0.5, 1.0, 1.0]))
     assert (firm[1:] > loose[1:]).all()
 

@@ -183,7 +183,7 @@ class Reach:
             InputError: Pinocchio, Coal or OMPL is not installed, or a posture is outside the joint limits.
         """
         position, quaternion = self._in_base(object_p[None], object_q[None])
-        model = self._model("transit")
+        model = self._model("plan")
         model.place_object(position[0].double().numpy(), quaternion[0].double().numpy())
         return plan(model, start, goal, hand, replace(self.settings.plan, seed=seed))
 
@@ -256,7 +256,8 @@ class Reach:
         failure, c = failure.clone(), len(candidates)
         position, quaternion = (x.double().numpy() for x in poses)
         hands = candidates.pregrasp.double().numpy()
-        approach, transit = self._model("approach"), self._model("transit")
+        approach = self._model("approach")
+        transit = self._model("transit" if self.settings.motion == "controller" else "plan")
         for i in (failure == OK).nonzero()[:, 0].tolist():
             pose, hand = divmod(int(rows[i]), c)
             approach.place_object(position[pose], quaternion[pose])
@@ -276,13 +277,19 @@ class Reach:
             return True
         return plan(model, self.start.double().numpy(), standoff, hand, self.settings.plan) is not None
 
-    def _model(self, name: Literal["hand", "approach", "transit"]) -> CollisionModel:
+    def _model(self, name: Literal["hand", "approach", "transit", "plan"]) -> CollisionModel:
         """The collision model for one part of the motion, built at its first use."""
         if name not in self._models:
             s = self.settings
             clearance = {
                 "hand": {"hand object": -s.overlap},
                 "approach": {"arm": 0.0, "arm object": s.clearance},
+                "plan": {
+                    "arm": 0.0,
+                    "table": s.table_clearance,
+                    "arm object": s.clearance,
+                    "hand object": s.clearance,
+                },
                 "transit": {
                     "arm": -s.graze,
                     "table": s.table_clearance,
