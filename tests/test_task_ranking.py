@@ -11,6 +11,7 @@ from dora.affordance.objects.catalogue import load_object, own_objects
 from dora.affordance.reach.feasibility_table import file_name
 from dora.errors import InputError
 from dora.tasks import make_task
+from dora.tasks.cube import hand_made_candidates
 from dora.tools.task_ranking import (
     TaskRanking,
     _Balanced,
@@ -23,7 +24,7 @@ from dora.tools.task_ranking import (
 
 
 def test_a_proof_tells_a_good_grasp_from_one_in_the_air():
-    good = load_candidates("cube").select([0])
+    good = hand_made_candidates().select([0])
     away = replace(good, position=good.position + torch.tensor([0.0, 0.0, 0.10]))
     ranking = rank_in_task("DoraCube-v1", concatenate([away, good]), 64, preset="none")
     assert ranking.tries.sum() <= 64

@@ -105,10 +105,10 @@ class JugConfig(TaskConfig):
     """Time for which the lifted jug must be held [s]."""
     free_overlap: float = 0.001
     """Overlap that costs no reward [m]."""
-    fewest_lifts: float = 0.55
+    fewest_lifts: float = 0.5
     """Smallest share of its executions that a ranked candidate must have survived to be used, as a share of the best
     candidate's [1]."""
-    most_candidates: int = 40
+    most_candidates: int = 12
     """Stored candidates that the task works with [1]."""
     reference: GraspSettings = field(default_factory=lambda: replace(GraspSettings(), hover=0.06))
     """Numbers of the reference; the hand is above the jug at first and would sweep over it, so it hovers."""

@@ -43,8 +43,8 @@ class ReachSettings:
         overlap: largest penetration depth of the opened hand in the object on the approach [m]; at the end of the
             approach the hand is meant to touch it.
         clearance: smallest distance of the arm from the object [m].
-        brush: how deep the hand would be in the object if that stood still in the controller's transit [m]; up to this it
-            pushes the object a little, and the grasp succeeds as often as without (docs/reachability.md).
+        brush: how deep the hand would be in the object if that stood still in the controller's transit [m]; up to
+            this it pushes the object a little, and the grasp succeeds as often as without (docs/reachability.md).
         graze: the same of two links of the arm, which slide along each other; on the approach they must not touch.
         speed: speed of the wrist on the approach [m/s], at which no joint may exceed its velocity limit.
         seeds: number of seeds of the inverse kinematics per candidate.
