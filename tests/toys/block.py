@@ -63,5 +63,5 @@ class BlockTask(Task):
         return Grid((0.55, 0.0), (0.08, 0.08))
 
     def place(self, scene: TaskScene, rows: Tensor, u: Tensor) -> None:
-        reachable = partial(self.reachable, scene.arms["arm"])
+        reachable = partial(self.startable, scene.arms["arm"])
         scene.object.set_pose(Pose.create_from_pq(*standing(u, scene.half[rows, 2], self.start_grid("arm"), reachable)))
