@@ -172,6 +172,10 @@ def test_a_bundled_policy_is_that_of_the_result_beside_it(path: Path):
 @pytest.mark.parametrize("path", COMMITTED, ids=lambda path: f"{path.parts[-3]}/{path.parts[-2]}")
 def test_policies_of_versions_without_numbers_mean_the_numbers_of_then(path: Path):
     config = read_checkpoint(path).config
+    known = json.loads((path.parent / "result.json").read_text()).get("task_config")
+    if known is not None:  # a later version, which says its numbers
+        assert config.task == known
+        return
     task = find_task(config.env).CONFIG
     first = yaml.safe_load(FIRST.read_text())
     assert config.task == first["tasks"][config.env] | {"randomisation": first["presets"][config.preset]}
