@@ -44,7 +44,7 @@ class Run:
         agent = result["agent"].upper()
         agent += ", paper's reward" if result.get("reward", "dense") == "paper" else ""
         agent += ", evaluated again" if result.get("checkpoint") else ""
-        return result["env"], task.get("preset", DEFAULT_PRESET), agent, guidance, round(result["env_steps"] / 1000)
+        return result["env"], task.get("preset", DEFAULT_PRESET), agent, guidance, round(self.budget / 1000)
 
     @property
     def budget(self) -> int:
