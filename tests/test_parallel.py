@@ -81,7 +81,7 @@ def test_workers_end_with_the_process_that_started_them(tmp_path: Path, kill: si
     else:
         process.kill()
     started = time.monotonic()
-    _, errors = process.communicate(timeout=60)  # until all who write there have ended
+    _, errors = process.communicate(timeout=20)  # until all who write there have ended
     assert time.monotonic() - started < 5
     assert process.returncode == -kill
     assert errors.count("Traceback") == (kill is signal.SIGINT), errors

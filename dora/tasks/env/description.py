@@ -53,6 +53,7 @@ def limit_rows(env: Any) -> Rows:
         ["episode", f"{steps} steps, {steps * c.dt:g} s"],
         ["solver position iterations", str(c.solver_iterations)],
         ["largest penetration of a success", f"{c.penetration_limit * 1000:g} mm"],
+        ["control steps that ranking the candidates took", str(env.ranking_steps or "unknown")],
     ]
 
 
