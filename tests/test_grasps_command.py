@@ -48,6 +48,8 @@ def script() -> ModuleType:
         ("--object jug --by-region -1", "--by-region is -1"),
         ("--object jug --by-region 8", "--validate sapien with it"),
         ("--object jug --region spoon", "no region 'spoon'"),
+        ("--object jug --seat nan", "0 to 2.0 rad"),
+        ("--object cube --make-bundle --seat -0.1", "0 to 2.0 rad"),
         ("--object jug --scale 2", "belong to --mesh"),
         ("--object jug --out a.json", "ends in .safetensors"),
         ("--object jug --out /proc/nowhere/a.safetensors", "choose another --out"),
@@ -88,7 +90,7 @@ def test_files_and_table(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ):
     monkeypatch.setattr(grasps, "BASELINES", {name: QUICK for name in grasps.BASELINES})
-    monkeypatch.setattr(grasps, "Settings", lambda: QUICK)
+    monkeypatch.setattr("dora.commands.grasps.Settings", lambda **_: QUICK)
     monkeypatch.setenv("COLUMNS", "200")  # headings are not wrapped
     out = tmp_path / "new" / "jug.safetensors"
     arguments = ("--object", "jug", "--num", "6", "--baselines", "3", "--seed", "4", "--out", str(out))
@@ -262,7 +264,7 @@ def test_labelled_meshes_by_others_go_all_the_way(
 ):
     """Import, regions, search by region, simulation, files, and pictures of them, in a short search."""
     monkeypatch.setenv("DORA_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(grasps, "Settings", lambda: QUICK)
+    monkeypatch.setattr("dora.commands.grasps.Settings", lambda **_: QUICK)
     monkeypatch.setattr(album, "FINER", 1.0)
     options, shape = FOREIGN[name]
     labels, out = tmp_path / "labels.yaml", tmp_path / "found.safetensors"

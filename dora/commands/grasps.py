@@ -20,6 +20,7 @@ from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.importing import import_object
 from dora.affordance.search.backends import Kinematics
+from dora.affordance.search.optimise import Settings
 from dora.errors import InputError
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
@@ -66,6 +67,9 @@ class Args:
     """Candidates of each baseline; 0 leaves the baselines out."""
     kinematics: Kinematics = "compiled"
     """Search in compiled loops, or by automatic differentiation through pytorch_kinematics (slower)."""
+    seat: float = Settings.seat
+    """Angle by which the hand is closed around the object after the search [rad]; 0 leaves this out, for objects that
+    the palm would press onto a table."""
     by_region: int = 0
     """Candidates of a search for each other region and of a free one, simulated as well: how often each region is held
     with and without asking for it, and how well the vote tells (needs --validate sapien)."""
@@ -112,13 +116,23 @@ def run(args: Args) -> None:
     robot = load_robot(args.robot)
     out = args.out or Path("runs") / "grasps" / f"{obj.name}.safetensors"
     check_out(out)
-    simulate = args.validate == "sapien"
+    simulate, settings = args.validate == "sapien", Settings(seat=args.seat)
     with ProgressDisplay() as phases:
-        generated = generate(obj, robot, args.num, args.seed, region, phases, simulate, kinematics=args.kinematics)
+        generated = generate(
+            obj,
+            robot,
+            args.num,
+            args.seed,
+            region,
+            phases,
+            simulate,
+            Settings(seat=args.seat),
+            kinematics=args.kinematics,
+        )
         report = summary(generated) | {"kinematics": args.kinematics}
         searches = {}
         if args.by_region:
-            searches = by_region(obj, robot, args.by_region, args.seed, region, phases, args.kinematics)
+            searches = by_region(obj, robot, args.by_region, args.seed, region, phases, args.kinematics, settings)
             report["by_region"] = {name: summary(found) for name, found in searches.items()}
         if simulate:
             report["voting"] = voting_summary([generated, *searches.values()], obj)
@@ -148,7 +162,8 @@ def remake(args: Args) -> None:
     ids = tasks_of(load_object(name))
     with ProgressDisplay() as phases:
         if args.make_bundle:
-            print(make_bundle(name, args.seed, phases, usable_in_task(name), not args.any_region))
+            usable, settings = usable_in_task(name), Settings(seat=args.seat)
+            print(make_bundle(name, args.seed, phases, usable, not args.any_region, settings))
         if args.rank_in_task or ids:
             print(rank_bundled_set(name, lambda title: phases.phase(title, "episodes"), not args.any_region))
 

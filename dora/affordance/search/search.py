@@ -23,6 +23,9 @@ from dora.affordance.search.energies import GraspEnergy, Weights
 from dora.affordance.search.initial_poses import InitialPoses, Spread
 from dora.errors import InputError
 
+MOST_SEATING = 2.0
+"""Largest angle by which a hand is closed after the search [rad]."""
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -54,7 +57,7 @@ class Settings:
         spread: random spread of the initial poses.
 
     Raises:
-        InputError: a count is below 1.
+        InputError: a count is below 1, or `seat` is no angle from 0 to `MOST_SEATING`.
     """
 
     iterations: int = 40
@@ -83,6 +86,8 @@ class Settings:
         for name in ("iterations", "contacts", "resample", "starts", "batch"):
             if getattr(self, name) < 1:
                 raise InputError(f"the search needs {name} of at least 1, not {getattr(self, name)}.")
+        if not 0 <= self.seat <= MOST_SEATING:
+            raise InputError(f"the hand can be closed by 0 to {MOST_SEATING} rad after the search, not by {self.seat}.")
 
 
 CHECK = 5

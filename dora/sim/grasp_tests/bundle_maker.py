@@ -52,7 +52,12 @@ Usable = Callable[[GraspCandidates], Bool[Tensor, " c"]]
 
 
 def make_bundle(
-    name: str, seed: int, phases: ProgressDisplay, usable: Usable | None = None, region: bool = True
+    name: str,
+    seed: int,
+    phases: ProgressDisplay,
+    usable: Usable | None = None,
+    region: bool = True,
+    settings: Settings | None = None,
 ) -> Path:
     """Make and write the bundled set of an object; returns the path of its file.
 
@@ -64,22 +69,30 @@ def make_bundle(
             those; grasps of the other regions and unusable ones follow.
         region: whether the search knows the target region. If not, nothing asks for a region or a class; rounds,
             grasps that are ranked and grasps that are kept are as many.
+        settings: of the search; the defaults if None.
 
     Raises:
         InputError: unknown object, one without a folder, or too few valid grasps.
     """
-    path, maker = bundled_path(name, region), SetMaker(load_object(name), load_robot(ROBOT), phases, usable)
+    maker = SetMaker(load_object(name), load_robot(ROBOT), phases, usable, settings)
+    path = bundled_path(name, region)
     (maker.make(seed) if region else maker.make_for_any_region(seed)).save(path)
     return path
 
 
 class SetMaker:
-    """Makes the bundled set of one object for one robot; `usable` as in `make_bundle`."""
+    """Makes the bundled set of one object for one robot; `usable` and `settings` as in `make_bundle`."""
 
     def __init__(
-        self, obj: AffordanceObject, robot: RobotDescription, phases: ProgressDisplay, usable: Usable | None = None
+        self,
+        obj: AffordanceObject,
+        robot: RobotDescription,
+        phases: ProgressDisplay,
+        usable: Usable | None = None,
+        settings: Settings | None = None,
     ) -> None:
         self.obj, self.robot, self.phases, self.usable = obj, robot, phases, usable
+        self.settings = settings or Settings()
         self.reach = Reach(robot, obj, start=obj.start_posture)
 
     def make(self, seed: int) -> GraspCandidates:
@@ -100,7 +113,7 @@ class SetMaker:
         return replace(self.ranked(self.pool(seed, None)).select(slice(KEPT)), settings=self._made(seed))
 
     def _made(self, seed: int) -> str:
-        made = {"search": repr(Settings()), "grasp_test": repr(STANDARD), "ranking": repr(Execution()), "seed": seed}
+        made = {"search": repr(self.settings), "grasp_test": repr(STANDARD), "ranking": repr(Execution()), "seed": seed}
         return json.dumps(made)
 
     def pool(self, seed: int, label: str | None) -> GraspCandidates:
@@ -129,8 +142,8 @@ class SetMaker:
             The candidates; None if none is left.
         """
         found = optimise(
-            self.obj, self.robot, num, seed, label,
-            progress=self.phase(f"search {label or 'any region'}", 1 / Settings().iterations),
+            self.obj, self.robot, num, seed, label, self.settings,
+            progress=self.phase(f"search {label or 'any region'}", 1 / self.settings.iterations),
         )  # fmt: skip
         good = found.valid & (found.self_penetration < STANDARD.strict_self_penetration)
         if label is not None:

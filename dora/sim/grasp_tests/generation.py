@@ -188,6 +188,7 @@ def by_region(
     region: str | None,
     phases: ProgressDisplay,
     kinematics: str = "compiled",
+    settings: Settings | None = None,
 ) -> dict[str, Generated]:
     """Validated grasps of a search without a region ("any") and of one for each region other than `region`, by name.
 
@@ -195,7 +196,7 @@ def by_region(
     """
     others = {FREE: None} | {label: label for label in obj.labels}
     return {
-        name: generate(obj, robot, num, seed, label, phases, name=name, kinematics=kinematics)
+        name: generate(obj, robot, num, seed, label, phases, settings=settings, name=name, kinematics=kinematics)
         for name, label in others.items()
         if label != region
     }
