@@ -8,7 +8,20 @@ with ManiSkill, and adds `sim_backend="physx_cpu_batch"` to all tasks:
     env = gym.make("Empty-v1", robot_uids="diana7_hit")
 """
 
-import mani_skill.envs as _stock_tasks  # noqa: F401
+import sys as _sys
+from pathlib import Path as _Path
 
-from dora import tasks as tasks
-from dora.sim import robots as _robots  # noqa: F401
+from dora.version import version as _version
+
+__version__ = _version()
+
+
+def _is_command() -> bool:
+    """Whether Python starts `dora` or `python -m dora`, which registers everything when it knows what to do."""
+    program, arguments = _sys.argv[0], _sys.argv[1:]
+    asked = _sys.orig_argv[: len(_sys.orig_argv) - len(arguments)]
+    return asked[-1] in ("dora", "-mdora") if program == "-m" else _Path(program).name in ("dora", "dora.exe")
+
+
+if not _is_command():
+    from dora import registration as registration

@@ -3,18 +3,17 @@
 import dataclasses
 import importlib.metadata
 import platform
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-import dora
 from dora.agents.config import RunConfig, config_from_dict
 from dora.agents.evaluation.evaluate import Evaluation
 from dora.configs import plain
 from dora.errors import InputError
 from dora.files import write_bytes, write_csv, write_json
+from dora.version import source_commit
 
 PACKAGES = ("dora", "mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 """Packages whose versions are written."""
@@ -175,18 +174,6 @@ def steps_to(success: float, curve: list[list[Any]]) -> int | None:
     """Environment steps of the first row of a learning curve with this success rate; None if there is none."""
     at, rate = CURVE_HEADER.index("env_steps"), CURVE_HEADER.index("success_rate")
     return next((row[at] for row in curve if row[rate] >= success), None)
-
-
-def source_commit() -> str | None:
-    """Commit of the checkout that runs, with "-dirty" if files of it have changed; None for an installed package."""
-    root = Path(dora.__file__).parents[1]
-    if not (root / ".git").exists():
-        return None
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return None
 
 
 def _versions() -> str:

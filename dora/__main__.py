@@ -1,0 +1,80 @@
+"""The command `dora`, also `python -m dora`: one word selects what to do, the rest are its options.
+
+What does the work is imported only when it is needed, so that help and version come at once.
+"""
+
+import difflib
+import importlib
+import sys
+from collections.abc import Sequence
+
+from dora.version import version_line
+
+COMMANDS = {
+    "run": "train or evaluate a learner on a task",
+    "grasps": "search for grasps of an object, judge them, and store them",
+    "view": "show an object, its regions and its grasps on a web page",
+    "bench": "measure how fast the parts of Dora are",
+    "report": "make tables and figures of finished runs",
+}
+"""What `dora NAME` does; the body of each is the module `dora.commands.NAME`."""
+SHELLS = ("bash", "zsh", "fish")
+"""Shells for which --completion prints a script."""
+BAD_INPUT = 2
+"""Exit status after input that a person can mend."""
+
+
+def usage() -> str:
+    """The text of `dora --help`."""
+    width = max(map(len, COMMANDS))
+    rows = "\n".join(f"  {name:<{width}}  {what}" for name, what in COMMANDS.items())
+    return f"""usage: dora COMMAND [OPTIONS]
+
+Affordance-guided dexterous manipulation on ManiSkill, with TorchRL agents.
+
+{rows}
+
+  dora COMMAND --help                options of a command
+  dora --version                     version and commit
+  dora --completion {{{",".join(SHELLS)}}}    script that completes commands and options
+
+Example: dora run --env DoraHammer-v1
+"""
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status.
+
+    Args:
+        words: of the command line, without the name of the program; those of the process by default.
+    """
+    first, *rest = list(sys.argv[1:] if words is None else words) or [""]
+    if first in ("", "-h", "--help"):
+        print(usage(), end="")
+        return 0 if first else BAD_INPUT
+    if first == "--version":
+        print(version_line())
+        return 0
+    if first == "--completion":
+        return _complete(rest)
+    if first not in COMMANDS:
+        near = difflib.get_close_matches(first, COMMANDS, 1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        print(f"dora has no command {first!r}.{hint} The commands are: {', '.join(COMMANDS)}.", file=sys.stderr)
+        return BAD_INPUT
+    sys.argv = [f"dora {first}", *rest]
+    importlib.import_module("dora.registration")
+    return importlib.import_module(f"dora.commands.{first}").main()
+
+
+def _complete(rest: Sequence[str]) -> int:
+    if len(rest) != 1 or rest[0] not in SHELLS:
+        print(f"--completion needs the name of a shell: {', '.join(SHELLS)}.", file=sys.stderr)
+        return BAD_INPUT
+    importlib.import_module("dora.registration")
+    print(importlib.import_module("dora.commands.completion").script(COMMANDS, rest[0]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

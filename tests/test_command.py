@@ -1,0 +1,120 @@
+"""The command `dora`: help at once, one word per command, completion, and registration when it is needed."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from dora import __main__ as command
+from dora.version import source_commit, version_line
+
+HELP_SECONDS = 0.5
+"""Longest time of --help and --version [s]."""
+TRIES = 5
+"""Tries of which the quickest counts, so that other work on the machine does not."""
+MODULE = (sys.executable, "-m", "dora")
+
+
+def run(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(words, capture_output=True, text=True, cwd=cwd)
+
+
+def quickest(*words: str) -> float:
+    """Time of the quickest of some calls [s]."""
+    seconds = []
+    for _ in range(TRIES):
+        start = time.perf_counter()
+        assert run(*words).returncode == 0
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)
+
+
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_help_and_version_come_at_once(option: str):
+    assert quickest(*MODULE, option) < HELP_SECONDS
+
+
+def test_the_version_names_the_commit():
+    shown = run(*MODULE, "--version").stdout.strip()
+    assert shown == version_line()
+    assert str(source_commit()) in shown
+
+
+def test_a_wheel_names_the_commit_that_it_was_made_from(tmp_path: Path):
+    (tmp_path / "_commit").write_text("0123456789ab\n")
+    assert source_commit(tmp_path) == "0123456789ab"
+
+
+def test_without_git_and_wheel_no_commit_is_named(tmp_path: Path):
+    (tmp_path / "dora").mkdir()
+    assert source_commit(tmp_path / "dora") is None
+
+
+def test_every_command_is_listed_and_has_help(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    assert command.main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    for name, what in command.COMMANDS.items():
+        assert name in shown
+        assert what in shown
+        monkeypatch.setattr(sys, "argv", ["dora"])
+        with pytest.raises(SystemExit) as status:
+            command.main([name, "--help"])
+        assert status.value.code == 0
+        assert f"dora {name}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("rum", "'run'"), ("grasp", "'grasps'")])
+def test_a_typo_gets_a_suggestion(capsys: pytest.CaptureFixture[str], typed: str, meant: str):
+    assert command.main([typed]) == command.BAD_INPUT
+    assert f"Did you mean {meant}" in capsys.readouterr().err
+
+
+def test_without_a_command_the_usage_is_shown(capsys: pytest.CaptureFixture[str]):
+    assert command.main([]) == command.BAD_INPUT
+    assert "usage: dora COMMAND" in capsys.readouterr().out
+
+
+def test_a_command_runs_in_any_folder(tmp_path: Path):
+    """As a process, where Dora registers its tasks only when the command is known."""
+    done = run(*MODULE, "run", "--env", "DoraCube-v2", cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert "DoraCube-v1" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_import_registers_everything_elsewhere(tmp_path: Path):
+    """Also in a module that is started by -m, and in a script whose name begins like the command's."""
+    body = "import dora, gymnasium as gym; gym.spec('DoraCube-v1'); gym.spec('PickCube-v1'); print('found')"
+    for name in ("other", "dora_script"):
+        (tmp_path / f"{name}.py").write_text(body)
+        assert run(sys.executable, "-m", name, cwd=tmp_path).stdout.endswith("found\n")
+    assert run(sys.executable, "dora_script.py", cwd=tmp_path).stdout.endswith("found\n")
+
+
+@pytest.mark.parametrize("shell", command.SHELLS)
+def test_completion_knows_commands_and_options(capsys: pytest.CaptureFixture[str], shell: str):
+    assert command.main(["--completion", shell]) == 0
+    script = capsys.readouterr().out
+    for word in (*command.COMMANDS, "zero-correction", "any-region", "num-envs", "pictures"):
+        assert word in script
+
+
+def test_bash_completes_a_command_and_an_option(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    assert command.main(["--completion", "bash"]) == 0
+    path = tmp_path / "dora.bash"
+    path.write_text(capsys.readouterr().out)
+    for typed, wanted in ((("gr",), "grasps"), (("run", "--zero"), "--zero-correction"), (("bench", "ph"), "physics")):
+        words = " ".join(("dora", *typed))
+        ask = (
+            f"source {path}; COMP_WORDS=({words}); COMP_CWORD={len(typed)}; COMP_LINE='{words}'; "
+            "COMP_POINT=${#COMP_LINE}; $(complete -p dora | sed 's/.*-F \\([^ ]*\\).*/\\1/'); "
+            'printf "%s\\n" "${COMPREPLY[@]}"'
+        )
+        assert wanted in run("bash", "-c", ask).stdout.split()
+
+
+def test_completion_of_an_unknown_shell_is_refused(capsys: pytest.CaptureFixture[str]):
+    assert command.main(["--completion", "tsch"]) == command.BAD_INPUT
+    assert "bash, zsh, fish" in capsys.readouterr().err
