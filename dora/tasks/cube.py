@@ -89,10 +89,10 @@ class CubeConfig(TaskConfig):
     """Largest overlap in an episode that counts as a success [m]."""
     optimised: bool = False
     """Use the candidates that the optimiser found in place of one made by hand; `guidance="grasps"` always does."""
-    fewest_lifts: float = 0.4
+    fewest_lifts: float = 0.3
     """Smallest share of its executions that a ranked candidate must have survived to be used, as a share of the best
     candidate's [1]."""
-    most_candidates: int = 40
+    most_candidates: int = 12
     """Stored candidates that the task works with [1]."""
     weights: CubeWeights = field(default_factory=CubeWeights)
     """Weights of the reward terms."""
