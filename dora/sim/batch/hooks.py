@@ -4,7 +4,7 @@ Every wrapper calls ManiSkill's own code unless the environment runs on that bac
 """
 
 from collections.abc import Callable
-from functools import cached_property, wraps
+from functools import cached_property, partial, wraps
 from importlib.metadata import version
 from typing import Any
 
@@ -22,6 +22,7 @@ from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
 from sapien import physx
 
 from dora.errors import InputError
+from dora.sim.batch import resets
 from dora.sim.batch.actions import check_action
 from dora.sim.batch.rendering import can_render, replace_materials
 from dora.sim.batch.scene import BatchScene
@@ -55,6 +56,9 @@ def install() -> None:
         (BaseEnv, "__init__", _init),
         (BaseEnv, "_setup_scene", _setup_scene),
         (BaseEnv, "_step_action", _step_action),
+        (BaseEnv, "reset", partial(_where_batched, resets.reset)),
+        (BaseEnv, "set_state", partial(_where_batched, resets.set_state)),
+        (BaseEnv, "set_state_dict", partial(_where_batched, resets.set_state_dict)),
         (Articulation, "get_collision_meshes", _get_meshes),
         (Articulation, "get_visual_meshes", _get_meshes),
         (PDEEPosController, "set_action", _set_pose_action),
@@ -77,6 +81,15 @@ def runs_batched(env: Any) -> bool:
 
 
 # ---- environments --------------------------------------------------------------------------------
+
+
+def _where_batched(ours: Callable, original: Callable) -> Callable:
+    """A method that is `ours` on this back end, which gets the original as its first argument; elsewhere that one."""
+
+    def method(self: BaseEnv, *args: Any, **kwargs: Any) -> Any:
+        return ours(original, self, *args, **kwargs) if runs_batched(self) else original(self, *args, **kwargs)
+
+    return method
 
 
 def _parse_backends(original: Callable) -> Callable:
