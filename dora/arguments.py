@@ -66,6 +66,11 @@ def tensors(state: Any, what: str, device: torch.device | str | None = None) -> 
     return as_tensor(state, what, device)
 
 
+def taken(state: Any, index: Tensor) -> Any:
+    """Rows of all tensors in nested dicts."""
+    return {name: taken(part, index) for name, part in state.items()} if isinstance(state, dict) else state[index]
+
+
 def is_mask(rows: Any) -> bool:
     """Whether an index of environments is a mask: a boolean for each of them."""
     dtype = rows.dtype if isinstance(rows, Tensor) else np.asarray(rows).dtype

@@ -24,7 +24,8 @@ def checked_options(options: Any, count: int, device: torch.device) -> dict[str,
 
     Args:
         options: as of ManiSkill's `reset`, or None. With a mask as `env_idx`, states may have a row for each
-            environment, of which those of the mask are used.
+            environment, of which those of the mask are used. ManiSkill writes rows in ascending order whatever
+            `env_idx` says, so it becomes ascending, and states are put in that order.
         count: how many environments there are.
         device: where tensors are wanted.
 
@@ -36,18 +37,25 @@ def checked_options(options: Any, count: int, device: torch.device) -> dict[str,
     if not isinstance(options, Mapping):
         raise InputError(f"the options of reset must be a dictionary, not {options!r}.")
     out = {name: value for name, value in options.items() if not (name in ("env_idx", START) and value is None)}
-    mask = None
+    mask = order = None
     if "env_idx" in out:
         rows = checked_rows(out["env_idx"], count, device)
         mask = rows if is_mask(out["env_idx"]) else None
-        out["env_idx"] = rows
+        out["env_idx"], order = rows.sort()
     if START in out:
         start = out[START]
         if not isinstance(start, Mapping) or STATES not in start:
             raise InputError(f"options[{START!r}] must be a dictionary with {STATES!r} and perhaps 'obs'.")
         given = {name: tensors(value, name, device) for name, value in start.items() if value is not None}
-        out[START] = {name: _of_mask(value, mask, count) for name, value in given.items()}
+        out[START] = {name: _in_order(_of_mask(value, mask, count), order) for name, value in given.items()}
     return out
+
+
+def _in_order(state: Any, order: Tensor | None) -> Any:
+    """A state whose rows are put in another order, as far as it has so many; one row stands for all."""
+    if isinstance(state, dict):
+        return {name: _in_order(part, order) for name, part in state.items()}
+    return state if order is None or state.ndim == 0 or len(state) != len(order) else state[order]
 
 
 def _of_mask(state: Any, rows: Tensor | None, count: int) -> Any:
@@ -137,6 +145,7 @@ def set_state_dict(original: Callable, env: Any, state: Any, env_idx: Any = None
         raise InputError(f"the state must be a dictionary as of get_state_dict, not {type(state).__name__}.")
     state = tensors(state, "state", env.device)
     count = env.num_envs if rows is None else len(rows)
+    rows, order = (None, slice(None)) if rows is None else rows.sort()
     for kind in KINDS:
         known = getattr(env.scene.state_dict_registry, kind)
         for name, values in state.get(kind, {}).items():
@@ -144,9 +153,8 @@ def set_state_dict(original: Callable, env: Any, state: Any, env_idx: Any = None
                 raise InputError(f"the state has {kind} {name!r}, which the scene has not: {suggestion(name, known)}")
             size = 13 if kind == "actors" else 13 + 2 * known[name].max_dof
             everywhere = len(known[name]._objs) == env.num_envs
-            state[kind][name] = rows_of(
-                values, count if everywhere else len(values), size, f"state[{kind!r}][{name!r}]"
-            )
+            shape = count if everywhere else len(values), size
+            state[kind][name] = rows_of(values, *shape, f"state[{kind!r}][{name!r}]")[order if everywhere else ...]
     if count:
         original(env, state, *(() if rows is None else (rows,)))
 

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from torch import Tensor
 
-from dora.arguments import checked_seeds
+from dora.arguments import checked_rows, checked_seeds
 from dora.sim.batch.resets import START, checked_options
 
 SCALE_DRAW = 256
@@ -26,16 +26,16 @@ def requested(env: Any, seed: Any, options: Any) -> tuple[int | list[int] | None
     Raises:
         InputError: as `dora.arguments.checked_seeds` and `dora.sim.batch.resets.checked_options`.
     """
-    options = checked_options(options, env.num_envs, env.device)
-    rows = options.get("env_idx")
-    if rows is not None and len(rows) < env.num_envs:
-        if (seeds := checked_seeds(seed, len(rows))) is not None:
-            _sow(env, rows.tolist(), [seeds] if isinstance(seeds, int) else seeds)
-        return None, options
-    seeds = checked_seeds(seed, env.num_envs)
-    if rows is not None and isinstance(seeds, list) and len(seeds) == env.num_envs:
-        order = rows.argsort().tolist()
+    given, options = options, checked_options(options, env.num_envs, env.device)
+    rows = options.get("env_idx", range(env.num_envs))
+    seeds = checked_seeds(seed, len(rows))
+    if "env_idx" in options and isinstance(seeds, list) and len(seeds) == len(rows):
+        order = checked_rows(given["env_idx"], env.num_envs).argsort().tolist()
         seeds = [seeds[k] for k in order]
+    if len(rows) < env.num_envs:
+        if seeds is not None and len(rows) > 0:
+            _sow(env, options["env_idx"].tolist(), [seeds] if isinstance(seeds, int) else seeds)
+        return None, options
     if seeds is not None and START not in options:
         options["reconfigure"] = True
     return seeds, options

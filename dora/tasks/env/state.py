@@ -9,7 +9,7 @@ import torch
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from torch import Tensor
 
-from dora.arguments import as_tensor, checked_rows, tensors
+from dora.arguments import as_tensor, checked_rows, taken, tensors
 from dora.errors import InputError
 from dora.sim.batch.resets import KINDS, rows_of
 
@@ -83,7 +83,8 @@ def set_rows(env: Any, simulator: Callable[..., None], state: Any, env_idx: Any)
     rows = _chosen(env, env_idx)
     if len(rows) == 0:
         return
-    state = checked_state(env, state, rows)
+    order = rows.argsort()  # in which ManiSkill writes rows
+    rows, state = rows[order], taken(checked_state(env, state, rows), order)
     resize(env, state, rows)
     partial = {} if env_idx is None else {"env_idx": rows}
     simulator({kind: state[kind] for kind in KINDS}, **partial)
