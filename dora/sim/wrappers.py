@@ -18,6 +18,7 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 from dora.arguments import as_tensor
 from dora.configs import plain
+from dora.errors import InputError
 from dora.sim.batch.hooks import BACKEND
 from dora.sim.batch.resets import checked_options
 from dora.sim.robot_agent import DescribedRobot
@@ -40,6 +41,7 @@ def install_wrappers() -> None:
         (RecordEpisode, "reset", _reset),
         (RecordEpisode, "step", _step),
         (common, "_batch", _batch),
+        (BaseEnv, "render", _render),
     ):
         original = getattr(owner, name)
         setattr(owner, name, wraps(original)(wrapper(original)))
@@ -105,6 +107,19 @@ def _plain(value: Any) -> Any:
         return os.fspath(value)
     json.dumps(value)
     return value
+
+
+def _render(original: Callable) -> Callable:
+    def render(self: BaseEnv, *args: Any, **kwargs: Any) -> Any:
+        """ManiSkill's, or an InputError where nothing can be drawn."""
+        if self.render_mode is not None and not self.scene.can_render() and _is_ours(self):
+            raise InputError(
+                "nothing can be rendered: SAPIEN finds no Vulkan driver (see docs/rendering.md), or render_backend is "
+                f"{self.backend.render_backend!r}."
+            )
+        return original(self, *args, **kwargs)
+
+    return render
 
 
 # ---- recording -----------------------------------------------------------------------------------

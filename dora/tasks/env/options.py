@@ -10,12 +10,16 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from dora.configs import check_finite, check_not_negative, overridden
 from dora.errors import InputError
 from dora.robot import available_robots
+from dora.sim.batch.hooks import STATE_MODES
 from dora.sim.batch.rendering import can_render
 from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot
 from dora.sim.robots import register_robot
 from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import guidance_in_force
 from dora.tasks.mdp.randomisation import find_preset
+
+STATE_MODES_OR_DEFAULT = (None, *STATE_MODES)
+"""Observation modes that need no pictures, with that of a task that is asked for none."""
 
 
 @dataclass(frozen=True)
@@ -118,16 +122,21 @@ def _robots(robot_uids: Any, arms: int) -> tuple[str, ...]:
 
 
 def choose_render_backend(render_mode: str | None, obs_mode: str | None) -> str:
-    """The render backend for a task: "none" unless a picture can be asked for.
+    """The render backend for a task: "none" unless a picture can be asked for and there is a Vulkan driver.
+
+    ManiSkill's tools ask for a `render_mode` whether they draw or not, so that one alone is no reason to refuse;
+    `render` does where nothing can be drawn.
 
     Raises:
-        InputError: if one can be asked for and there is no Vulkan driver.
+        InputError: if observations are pictures and there is no Vulkan driver.
     """
-    if render_mode is None and obs_mode in (None, "state", "state_dict", "none"):
+    if render_mode is None and obs_mode in STATE_MODES_OR_DEFAULT:
         return "none"
-    if not can_render():
+    if can_render():
+        return "gpu" if torch.cuda.is_available() else "cpu"
+    if obs_mode not in STATE_MODES_OR_DEFAULT:
         raise InputError(
-            "rendering was asked for, but SAPIEN finds no Vulkan driver: install one (docs/rendering.md), or leave "
-            'render_mode at None and obs_mode at "state"'
+            f"obs_mode {obs_mode!r} needs pictures, but SAPIEN finds no Vulkan driver: install one "
+            '(docs/rendering.md), or choose "state"'
         )
-    return "gpu" if torch.cuda.is_available() else "cpu"
+    return "none"
