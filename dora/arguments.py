@@ -33,13 +33,19 @@ def as_tensor(value: Any, what: str, device: torch.device | str | None = None) -
     Raises:
         InputError: what it holds are not numbers, or its rows have different lengths.
     """
-    if isinstance(value, list | tuple) and any(isinstance(part, Tensor) for part in value):
+    if isinstance(value, list | tuple) and _holds_tensors(value):
         value = _stacked(value, what)
     if not isinstance(value, Tensor):
         array = _array(value, what)
         value = torch.from_numpy(array.astype(np.int64 if array.dtype.kind == "u" else array.dtype, copy=True))
+    if value.is_complex():
+        raise InputError(f"{what} must be real numbers, not complex ones.")
     value = value.detach().to(device)
     return value.to(torch.float32) if value.dtype == torch.float64 else value
+
+
+def _holds_tensors(value: Any) -> bool:
+    return isinstance(value, Tensor) or (isinstance(value, list | tuple) and any(map(_holds_tensors, value)))
 
 
 def _stacked(value: Any, what: str) -> Tensor:

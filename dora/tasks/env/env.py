@@ -3,7 +3,7 @@
 It reads the simulator once per control step; then only pure functions of that snapshot decide.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar, cast
 
 import gymnasium as gym
@@ -18,22 +18,19 @@ from mani_skill.utils.structs import Actor
 from mani_skill.utils.structs.types import SimConfig
 from torch import Tensor
 
-from dora.affordance.candidates import GraspCandidates
 from dora.affordance.reach.feasibility_table import ReachTable
-from dora.errors import InputError
 from dora.sim.batch.actions import checked_action
 from dora.sim.batch.resets import nothing_reset
 from dora.tasks.env.arm import Arm
 from dora.tasks.env.arm_group import ArmGroup
 from dora.tasks.env.description import describe
 from dora.tasks.env.episode_start import begin_episodes, drawn_sizes, requested
-from dora.tasks.env.options import check_options, task_config
+from dora.tasks.env.options import check_grasps, check_options, task_config
 from dora.tasks.env.perturbations import Perturbations
 from dora.tasks.env.scene import TaskScene, film_camera, sim_config
 from dora.tasks.env.state import saved_state, set_rows, unflattened
 from dora.tasks.env.task import Task
 from dora.tasks.guidance.guide import Guide
-from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import FILTER
 from dora.tasks.mdp.observations import observation_table
 from dora.tasks.mdp.rewards import Terms
@@ -87,11 +84,11 @@ class DoraEnv(BaseEnv):
         self,
         *args: Any,
         guidance: str = "affordance",
-        guidance_parts: Sequence[str] | None = None,
+        guidance_parts: Any = None,
         hand_joints: int = 20,
         preset: str = "standard",
-        config: Mapping[str, Any] | TaskConfig | None = None,
-        grasps: GraspCandidates | None = None,
+        config: Any = None,
+        grasps: Any = None,
         robot_uids: Any = "diana7_hit",
         num_envs: int = 1,
         control_mode: str | None = None,
@@ -105,8 +102,7 @@ class DoraEnv(BaseEnv):
             guidance, guidance_parts, hand_joints, task_config(self.TASK.CONFIG, preset, config), robot_uids,
             len(self.TASK.ARMS), num_envs, control_mode, sim_backend, render_backend, render_mode, obs_mode,
         )  # fmt: skip
-        if grasps is not None and len(self.TASK.ARMS) > 1:
-            raise InputError(f"grasps are of one arm, and there are {', '.join(self.TASK.ARMS)}: leave them out")
+        check_grasps(grasps, tuple(self.TASK.ARMS))
         self.parts, self.config, self._grasps = options.parts, options.config, grasps
         self.task, several = self.TASK(self.config), len(options.robots) > 1
         self._shares: dict[str, float] = {}
@@ -271,7 +267,7 @@ class DoraEnv(BaseEnv):
         return super().step(action)
 
     def _step_action(self, action: Any) -> Any:
-        action = checked_action(action, self.single_action_space, self.num_envs, self.device)
+        action = checked_action(self.arms.joined(action), self.single_action_space, self.num_envs, self.device)
         step = self._elapsed_steps
         self.task.remember(self.snapshot)
         command = None

@@ -1,12 +1,13 @@
 """The options that every Dora task takes, checked before anything is built."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from mani_skill.agents.registration import REGISTERED_AGENTS
 
+from dora.affordance.candidates import GraspCandidates
 from dora.configs import check_finite, check_not_negative, overridden
 from dora.errors import InputError
 from dora.robot import available_robots
@@ -34,7 +35,7 @@ class TaskOptions:
     render_backend: str
 
 
-def task_config(cls: type[TaskConfig], preset: str, changes: Mapping[str, Any] | TaskConfig | None) -> TaskConfig:
+def task_config(cls: type[TaskConfig], preset: str, changes: Any) -> TaskConfig:
     """The numbers of a task: its own, the preset's randomisation, then `changes`.
 
     Raises:
@@ -64,12 +65,12 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Mapping[str, Any] |
 
 def check_options(
     guidance: str,
-    guidance_parts: Sequence[str] | None,
+    guidance_parts: Any,
     hand_joints: int,
     config: TaskConfig,
     robot_uids: Any,
     arms: int,
-    num_envs: int,
+    num_envs: Any,
     control_mode: str | None,
     sim_backend: str,
     render_backend: str,
@@ -103,6 +104,16 @@ def check_options(
     if render_backend == "auto":
         render_backend = choose_render_backend(render_mode, obs_mode)
     return TaskOptions(parts, config, robots, mode, sim_backend, render_backend)
+
+
+def check_grasps(grasps: Any, arms: Sequence[str]) -> None:
+    """Refuses `grasps` of a task that are no candidates, or of a task with several arms."""
+    if grasps is None:
+        return
+    if not isinstance(grasps, GraspCandidates):
+        raise InputError(f"grasps must be GraspCandidates, such as GraspCandidates.load(path), not {grasps!r}")
+    if len(arms) > 1:
+        raise InputError(f"grasps are of one arm, and there are {', '.join(arms)}: leave them out")
 
 
 def _robots(robot_uids: Any, arms: int) -> tuple[str, ...]:
