@@ -70,10 +70,10 @@ def _init(original: Callable) -> Callable:
 
 def _set_mode(original: Callable) -> Callable:
     def set_control_mode(self: BaseAgent, control_mode: Any = None) -> None:
-        modes = self.supported_control_modes
-        if control_mode is not None and control_mode not in modes:
-            raise InputError(f"there is no control_mode {control_mode!r}: {suggestion(control_mode, modes)}")
-        original(self, control_mode)
+        mode, modes = control_mode or self._default_control_mode, self.supported_control_modes
+        if mode not in modes:
+            raise InputError(f"there is no control_mode {mode!r}: {suggestion(mode, modes)}")
+        original(self, mode)
 
     return set_control_mode
 

@@ -73,8 +73,7 @@ def _env_info(original: Callable) -> Callable:
         """ManiSkill's entry with an id that opens by itself, such as "dora:DoraCube-v1", the back end in use, and
         arguments that JSON can hold."""
         info, base = original(env), env.unwrapped
-        module = None if info is None else opening_module(base)
-        if module is None:
+        if info is None or (module := opening_module(base)) is None:
             return info
         kwargs = info["env_kwargs"] | {"sim_backend": base.backend.sim_backend}
         env_id = info["env_id"] if ":" in info["env_id"] else f"{module}:{info['env_id']}"

@@ -120,7 +120,7 @@ def _say_default() -> None:
 def _init(original: Callable) -> Callable:
     def init(self: BaseEnv, num_envs: Any = 1, *args: Any, **kwargs: Any) -> None:
         whole = isinstance(num_envs, int | np.integer)
-        if whole and batched_by_default(kwargs.get("sim_backend", "auto"), num_envs):
+        if whole and batched_by_default(kwargs.get("sim_backend", "auto"), int(num_envs)):
             kwargs["sim_backend"] = BACKEND
             _say_default()
         if kwargs.get("sim_backend") == BACKEND:
