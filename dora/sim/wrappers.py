@@ -111,7 +111,7 @@ def _plain(value: Any) -> Any:
 def _render(original: Callable) -> Callable:
     def render(self: BaseEnv, *args: Any, **kwargs: Any) -> Any:
         """ManiSkill's, or an InputError where nothing can be drawn."""
-        if self.render_mode is not None and not self.scene.can_render() and _is_ours(self):
+        if self.render_mode not in (None, "human") and not self.scene.can_render() and _is_ours(self):
             raise InputError(
                 "nothing can be rendered: SAPIEN finds no Vulkan driver (see docs/rendering.md), or render_backend is "
                 f"{self.backend.render_backend!r}."

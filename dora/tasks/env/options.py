@@ -135,19 +135,20 @@ def _robots(robot_uids: Any, arms: int) -> tuple[str, ...]:
 def choose_render_backend(render_mode: str | None, obs_mode: str | None) -> str:
     """The render backend for a task: "none" unless a picture can be asked for and there is a Vulkan driver.
 
-    ManiSkill's tools ask for a `render_mode` whether they draw or not, so that one alone is no reason to refuse;
-    `render` does where nothing can be drawn.
+    ManiSkill's tools ask for a `render_mode` whether they draw or not, so that one alone is no reason to refuse, but
+    for "human"; `render` does where nothing can be drawn.
 
     Raises:
-        InputError: if observations are pictures and there is no Vulkan driver.
+        InputError: if observations are pictures or a window is wanted, and there is no Vulkan driver.
     """
     if render_mode is None and obs_mode in STATE_MODES_OR_DEFAULT:
         return "none"
     if can_render():
         return "gpu" if torch.cuda.is_available() else "cpu"
-    if obs_mode not in STATE_MODES_OR_DEFAULT:
+    if obs_mode not in STATE_MODES_OR_DEFAULT or render_mode == "human":
+        wish = 'render_mode "human"' if render_mode == "human" else f"obs_mode {obs_mode!r}"
         raise InputError(
-            f"obs_mode {obs_mode!r} needs pictures, but SAPIEN finds no Vulkan driver: install one "
-            '(docs/rendering.md), or choose "state"'
+            f"{wish} needs pictures, but SAPIEN finds no Vulkan driver: install one "
+            '(docs/rendering.md), or leave render_mode at None and obs_mode at "state"'
         )
     return "none"
