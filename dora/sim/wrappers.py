@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from mani_skill import logger
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.utils import common
+from mani_skill.utils import common, tree
 from mani_skill.utils.registration import TimeLimitWrapper
 from mani_skill.utils.wrappers import record
+from mani_skill.utils.wrappers.cached_reset import CachedResetWrapper
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 from dora.arguments import as_tensor
@@ -41,6 +42,7 @@ def install_wrappers() -> None:
         (RecordEpisode, "reset", _reset),
         (RecordEpisode, "step", _step),
         (common, "_batch", _batch),
+        (CachedResetWrapper, "__init__", _cache),
         (BaseEnv, "render", _render),
     ):
         original = getattr(owner, name)
@@ -155,3 +157,12 @@ def _batch(original: Callable) -> Callable:
         return np.array([[array]]) if isinstance(array, np.generic) and np.ndim(array) == 0 else original(array)
 
     return batch
+
+
+def _cache(original: Callable) -> Callable:
+    def init(self: CachedResetWrapper, *args: Any, **kwargs: Any) -> None:
+        """ManiSkill's, which counts whole batches even where it stores a part of the last one."""
+        original(self, *args, **kwargs)
+        self._num_cached_resets = tree.shape(self._cached_resets_env_states, first_only=True)[0]
+
+    return init

@@ -233,7 +233,7 @@ class DoraEnv(BaseEnv):
 
     # ------------------------------------------------------------------- reset
 
-    def reset(self, seed: Any = None, options: dict | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """As in ManiSkill, but a seeded reset of all builds the scene anew: PhysX remembers earlier contacts, and
         would not repeat a trajectory bit for bit otherwise. In a partial one (`options["env_idx"]`) the seed is theirs.
 
