@@ -102,7 +102,7 @@ def _plain(value: Any) -> Any:
         return [_plain(part) for part in value]
     if isinstance(value, np.generic | np.ndarray | torch.Tensor):
         return value.tolist()
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+    if dataclasses.is_dataclass(value) and not any(isinstance(part, torch.Tensor) for part in vars(value).values()):
         return _plain(plain(value))
     if isinstance(value, os.PathLike):
         return os.fspath(value)
