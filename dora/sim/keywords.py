@@ -120,7 +120,7 @@ def checked_values(cls: type, kwargs: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         InputError: one sentence about the first value that is of the wrong type or out of range.
     """
-    out = dict(kwargs)
+    out = {k: "none" if k == "render_backend" and v is None else v for k, v in kwargs.items()}
     parameters = _parameters(cls)
     out |= {k: _typed(k, v, parameters[k].annotation) for k, v in out.items() if k in ("num_envs", "sim_backend")}
     if out.get("num_envs", 1) < 1:
@@ -145,7 +145,7 @@ def _typed(name: str, value: Any, annotation: Any) -> Any:
     """A value of the type of its annotation, as far as that is a text, a truth value or a whole number."""
     union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     kinds = set(typing.get_args(annotation) if union else (annotation,))
-    if value is None and (type(None) in kinds or name == "render_backend"):
+    if value is None and type(None) in kinds:
         return None
     kinds -= {type(None)}
     if kinds == {str} and not isinstance(value, str):
