@@ -61,8 +61,10 @@ def _init(original: Callable) -> Callable:
         kwargs = {**dict(zip(names, args, strict=False)), **kwargs}
         check_names(type(self), kwargs, names)
         if _is_checked(type(self), kwargs):
-            _check_sim_config(kwargs.get("sim_config") or {}, SimConfig, "sim_config")
-            _check_rates(kwargs.get("sim_config") or {}, self._default_sim_config)
+            _check_sim_config(config := kwargs.get("sim_config") or {}, SimConfig, "sim_config")
+            self.num_envs = kwargs.get("num_envs", 1)  # as in ManiSkill, whose tasks may use it for their settings
+            if config:
+                _check_rates(config, self._default_sim_config)
         original(self, **kwargs)
 
     return init
