@@ -19,7 +19,7 @@ def test_successes_are_recorded_and_can_be_played_again(tmp_path: Path):
     assert made.tried == 3
     assert 1 <= made.recorded <= 3
     index = json.loads(made.path.with_suffix(".json").read_text())
-    assert index["env_info"]["env_id"] == "DoraJug-v1"
+    assert index["env_info"]["env_id"] == "dora:DoraJug-v1"
     assert len(index["episodes"]) == made.recorded
     with h5py.File(made.path) as file:
         assert len(file) == made.recorded

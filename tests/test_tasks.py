@@ -299,6 +299,15 @@ def test_bad_actions_are_refused_and_move_nothing(backend: str, bad: str):
     task.close()
 
 
-def test_a_seed_with_a_partial_reset_is_refused(batch: DoraEnv):
-    with pytest.raises(InputError, match="seed"):
-        batch.reset(seed=0, options={"env_idx": torch.tensor([0])})
+def test_a_seed_in_a_partial_reset_is_that_of_its_rows_alone(batch: DoraEnv):
+    batch.reset(seed=0)
+    batch.step(actions(batch, 1)[0])
+    others, seeds = [0, 1, 3, 5], batch._episode_seed.copy()
+    first = batch.reset(seed=[7, 8], options={"env_idx": torch.tensor([4, 2])})[0]
+    batch.step(actions(batch, 1)[0])
+    again = batch.reset(seed=[8, 7], options={"env_idx": torch.tensor([2, 4])})[0]
+    assert torch.equal(first[[4, 2]], again[[4, 2]])
+    assert batch._episode_seed[[4, 2]].tolist() == [7, 8]
+    assert (batch._episode_seed[others] == seeds[others]).all()
+    with pytest.raises(InputError, match="3 seeds for 2 environments"):
+        batch.reset(seed=[1, 2, 3], options={"env_idx": [0, 1]})

@@ -220,7 +220,8 @@ class WristHandController(BaseController):
         if len(self.target) == 0:
             self.target = self.qpos.clone()
         self.target = self.target.index_copy(0, rows, target)
-        self.articulation.set_joint_drive_targets(self.target, self.joints, self.active_joint_indices)
+        written = self.target[self.scene._reset_mask]  # all, or in a partial reset those of its environments
+        self.articulation.set_joint_drive_targets(written, self.joints, self.active_joint_indices)
         if self.scene.gpu_sim_enabled:
             system: Any = self.scene.px  # PhysX's GPU system or BatchSystem
             system.gpu_apply_articulation_target_position()

@@ -1,4 +1,4 @@
-"""Checks of actions before they reach the simulator: shape, robots' names, finite numbers."""
+"""Actions before they reach the simulator: made tensors; shape, robots' names and finite numbers are checked."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,7 +8,28 @@ import torch
 from gymnasium import spaces
 from jaxtyping import Float
 
+from dora.arguments import as_tensor, suggestion
 from dora.errors import InputError
+
+
+def plain_action(action: Any, device: torch.device | str) -> Any:
+    """An action for `BaseEnv.step`, its numbers as float32 tensors without gradient; None stays None.
+
+    Args:
+        action: None, anything a tensor can be made of, or a dictionary as of `check_action`.
+        device: where tensors are wanted.
+
+    Raises:
+        InputError: no tensor can be made of it.
+    """
+    if action is None:
+        return None
+    if not isinstance(action, Mapping):
+        return as_tensor(action, "The action", device).to(torch.float32)
+    names = ("action",) if "control_mode" in action else tuple(action)
+    if lacking := [name for name in names if action.get(name) is None]:
+        raise InputError(f"The action has no {lacking[0]!r}: a dictionary needs numbers for each of its parts.")
+    return {**action, **{name: as_tensor(action[name], f"The action {name!r}", device).float() for name in names}}
 
 
 def check_action(env: Any, action: Any) -> None:
@@ -23,6 +44,10 @@ def check_action(env: Any, action: Any) -> None:
         InputError: a shape or a robot's name does not fit, or a number is not finite.
     """
     if isinstance(action, Mapping) and "control_mode" in action:
+        modes = getattr(env.agent, "supported_control_modes", [])
+        if modes and action["control_mode"] not in modes:
+            mode = action["control_mode"]
+            raise InputError(f"The action is for the unknown control_mode {mode!r}: {suggestion(mode, modes)}")
         if action["control_mode"] == env.agent.control_mode:
             check_array(action.get("action"), env._orig_single_action_space, env.num_envs, "")
         else:
@@ -70,6 +95,6 @@ def checked_action(action: Any, space: Any, num_envs: int, device: torch.device)
     """
     if action is None:
         return None
-    out = torch.as_tensor(action, dtype=torch.float32, device=device).detach()
+    out = plain_action(action, device)
     check_array(out, space, num_envs)
     return out.reshape(num_envs, -1)

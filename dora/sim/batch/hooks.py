@@ -4,7 +4,7 @@ Every wrapper calls ManiSkill's own code unless the environment runs on that bac
 """
 
 from collections.abc import Callable
-from functools import cached_property, wraps
+from functools import cache, cached_property, partial, wraps
 from importlib.metadata import version
 from typing import Any
 
@@ -22,7 +22,8 @@ from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
 from sapien import physx
 
 from dora.errors import InputError
-from dora.sim.batch.actions import check_action
+from dora.sim.batch import resets
+from dora.sim.batch.actions import check_action, plain_action
 from dora.sim.batch.rendering import can_render, replace_materials
 from dora.sim.batch.scene import BatchScene
 
@@ -55,6 +56,9 @@ def install() -> None:
         (BaseEnv, "__init__", _init),
         (BaseEnv, "_setup_scene", _setup_scene),
         (BaseEnv, "_step_action", _step_action),
+        (BaseEnv, "reset", partial(_where_batched, resets.reset)),
+        (BaseEnv, "set_state", partial(_where_batched, resets.set_state)),
+        (BaseEnv, "set_state_dict", partial(_where_batched, resets.set_state_dict)),
         (Articulation, "get_collision_meshes", _get_meshes),
         (Articulation, "get_visual_meshes", _get_meshes),
         (PDEEPosController, "set_action", _set_pose_action),
@@ -79,11 +83,20 @@ def runs_batched(env: Any) -> bool:
 # ---- environments --------------------------------------------------------------------------------
 
 
+def _where_batched(ours: Callable, original: Callable) -> Callable:
+    """A method that is `ours` on this back end, which gets the original as its first argument; elsewhere that one."""
+
+    def method(self: BaseEnv, *args: Any, **kwargs: Any) -> Any:
+        return ours(original, self, *args, **kwargs) if runs_batched(self) else original(self, *args, **kwargs)
+
+    return method
+
+
 def _parse_backends(original: Callable) -> Callable:
     def parse(sim_backend: str, render_backend: str | None) -> BackendInfo:
         """ManiSkill's result, or its result for a CPU with the name of this back end."""
         if sim_backend != BACKEND:
-            return original(sim_backend, render_backend)
+            return original(sim_backend, render_backend or "none")
         info = original("physx_cpu", render_backend or "none")
         info.sim_backend = BACKEND
         if not can_render():
@@ -94,10 +107,24 @@ def _parse_backends(original: Callable) -> Callable:
     return parse
 
 
+def batched_by_default(sim_backend: str, num_envs: int) -> bool:
+    """Whether this back end is what "auto" means: for several environments on a machine without CUDA."""
+    return sim_backend == "auto" and num_envs > 1 and not torch.cuda.is_available()
+
+
+@cache
+def _say_default() -> None:
+    logger.warning(f'There is no CUDA: several environments run with sim_backend="{BACKEND}" unless another is given.')
+
+
 def _init(original: Callable) -> Callable:
     def init(self: BaseEnv, num_envs: Any = 1, *args: Any, **kwargs: Any) -> None:
+        whole = isinstance(num_envs, int | np.integer)
+        if whole and batched_by_default(kwargs.get("sim_backend", "auto"), int(num_envs)):
+            kwargs["sim_backend"] = BACKEND
+            _say_default()
         if kwargs.get("sim_backend") == BACKEND:
-            if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            if not whole or num_envs < 1:
                 raise InputError(f"num_envs is {num_envs!r}: it must be a whole number of at least 1.")
             if kwargs.get("parallel_in_single_scene"):
                 raise InputError(f"parallel_in_single_scene is not available on {BACKEND}: leave it out.")
@@ -135,6 +162,7 @@ def _step_action(original: Callable) -> Callable:
         """Checks the action, then defers the physics steps of the control step to one pass per environment."""
         if not runs_batched(self):
             return original(self, action)
+        action = plain_action(action, self.device)
         check_action(self, action)
         hooks = ("_before_simulation_step", "_after_simulation_step")
         watched = any(_is_overridden(self, hook) for hook in hooks)

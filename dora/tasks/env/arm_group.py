@@ -1,11 +1,14 @@
 """All arms of a task: the parts of an action, the commands of their controllers, and their references step by step."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dora.arguments import as_tensor
+from dora.errors import InputError
 from dora.tasks.env.arm import Arm
 from dora.tasks.guidance.candidate_choice import CandidateChoice
 from dora.tasks.mdp.snapshot import Snapshot
@@ -39,6 +42,33 @@ class ArmGroup(dict[str, Arm]):
         """As `Guide.anneal`, for every arm."""
         for arm in self.values():
             arm.guide.anneal(**shares)
+
+    def joined(self, action: Any) -> Any:
+        """One action of a dictionary: of its `action` beside a `control_mode`, or of the parts by robot, one after the
+        other; everything else as it is.
+
+        Raises:
+            InputError: the control mode is not the present one, or the robots are others.
+        """
+        if not isinstance(action, Mapping):
+            return action
+        agents = [arm.agent for arm in self.values()]
+        if "control_mode" in action:
+            if (mode := action["control_mode"]) != agents[0].control_mode:
+                raise InputError(
+                    f"The action is for control_mode {mode!r} but the environment was made with "
+                    f"{agents[0].control_mode!r}, which it keeps: make another one with control_mode={mode!r}."
+                )
+            if action.get("action") is None:
+                raise InputError("The action has no 'action': a dictionary needs numbers for each of its parts.")
+            return action["action"]
+        names = [f"{agent.uid}-{k}" for k, agent in enumerate(agents)]
+        if len(names) == 1:
+            raise InputError("The action is a dictionary but there is one robot only: pass an array.")
+        for known in (names, list(self)):
+            if action.keys() == set(known):
+                return torch.cat([as_tensor(action[name], f"The action of {name}") for name in known], -1)
+        raise InputError(f"The action has keys {sorted(action)} but the robots are {names}.")
 
     def commands(self, observed: Snapshot, action: Float[Tensor, "n a"]) -> Any:
         """What ManiSkill's controllers are asked.

@@ -3,7 +3,7 @@
 It reads the simulator once per control step; then only pure functions of that snapshot decide.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar, cast
 
 import gymnasium as gym
@@ -18,21 +18,19 @@ from mani_skill.utils.structs import Actor
 from mani_skill.utils.structs.types import SimConfig
 from torch import Tensor
 
-from dora.affordance.candidates import GraspCandidates
 from dora.affordance.reach.feasibility_table import ReachTable
-from dora.errors import InputError
 from dora.sim.batch.actions import checked_action
+from dora.sim.batch.resets import nothing_reset
 from dora.tasks.env.arm import Arm
 from dora.tasks.env.arm_group import ArmGroup
 from dora.tasks.env.description import describe
-from dora.tasks.env.episode_start import begin_episodes, drawn_sizes
-from dora.tasks.env.options import check_options, task_config
+from dora.tasks.env.episode_start import begin_episodes, drawn_sizes, requested
+from dora.tasks.env.options import check_grasps, check_options, task_config
 from dora.tasks.env.perturbations import Perturbations
 from dora.tasks.env.scene import TaskScene, film_camera, sim_config
-from dora.tasks.env.state import resize, restore, saved_state
+from dora.tasks.env.state import saved_state, set_rows, unflattened
 from dora.tasks.env.task import Task
 from dora.tasks.guidance.guide import Guide
-from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import FILTER
 from dora.tasks.mdp.observations import observation_table
 from dora.tasks.mdp.rewards import Terms
@@ -77,6 +75,8 @@ class DoraEnv(BaseEnv):
     """The task that it has, an instance of `TASK`."""
     narrow: Callable[[Tensor], Tensor] | None = None
     """Takes the (b, c) candidates that b new episodes may use and returns fewer; to try candidates one by one."""
+    resetting = False
+    """Whether a reset is under way."""
     _snapshot: Snapshot | None = None
     _observed: Snapshot
 
@@ -84,11 +84,11 @@ class DoraEnv(BaseEnv):
         self,
         *args: Any,
         guidance: str = "affordance",
-        guidance_parts: Sequence[str] | None = None,
+        guidance_parts: Any = None,
         hand_joints: int = 20,
         preset: str = "standard",
-        config: Mapping[str, Any] | TaskConfig | None = None,
-        grasps: GraspCandidates | None = None,
+        config: Any = None,
+        grasps: Any = None,
         robot_uids: Any = "diana7_hit",
         num_envs: int = 1,
         control_mode: str | None = None,
@@ -102,8 +102,7 @@ class DoraEnv(BaseEnv):
             guidance, guidance_parts, hand_joints, task_config(self.TASK.CONFIG, preset, config), robot_uids,
             len(self.TASK.ARMS), num_envs, control_mode, sim_backend, render_backend, render_mode, obs_mode,
         )  # fmt: skip
-        if grasps is not None and len(self.TASK.ARMS) > 1:
-            raise InputError(f"grasps are of one arm, and there are {', '.join(self.TASK.ARMS)}: leave them out")
+        check_grasps(grasps, tuple(self.TASK.ARMS))
         self.parts, self.config, self._grasps = options.parts, options.config, grasps
         self.task, several = self.TASK(self.config), len(options.robots) > 1
         self._shares: dict[str, float] = {}
@@ -234,21 +233,22 @@ class DoraEnv(BaseEnv):
 
     # ------------------------------------------------------------------- reset
 
-    def reset(self, seed: Any = None, options: dict | None = None) -> tuple[Any, dict[str, Any]]:
-        """As in ManiSkill, but a seeded reset builds the scene anew: PhysX remembers earlier contacts, and would
-        not repeat a trajectory bit for bit otherwise. A partial reset (`options["env_idx"]`) takes no seed.
+    def reset(self, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """As in ManiSkill, but a seeded reset of all builds the scene anew: PhysX remembers earlier contacts, and
+        would not repeat a trajectory bit for bit otherwise. In a partial one (`options["env_idx"]`) the seed is theirs.
 
         Raises:
-            InputError: if a seed comes together with `env_idx`, since ManiSkill would reseed every environment.
+            InputError: seeds, `env_idx` or states are of another kind or shape.
         """
-        if seed is not None and options and "env_idx" in options:
-            raise InputError("a partial reset (env_idx) cannot take a seed: it would reseed every environment")
-        seeds = seed if seed is None or isinstance(seed, int) else list(seed)
+        seeds, options = requested(self, seed, options)
+        if "env_idx" in options and len(options["env_idx"]) == 0:
+            return nothing_reset(self)
         gym.Env.reset(self, seed=seeds[0] if isinstance(seeds, list) else seeds)  # gymnasium's own generator
-        self._snapshot = None
-        if seed is not None and "reset_to_env_states" not in (options or {}):
-            options = {**(options or {}), "reconfigure": True}
-        return super().reset(seed=seeds, options=options)
+        self._snapshot, self.resetting = None, True
+        try:
+            return super().reset(seed=seeds, options=options)
+        finally:
+            self.resetting = False
 
     def _initialize_episode(self, env_idx: Tensor, options: dict) -> None:
         begin_episodes(self, env_idx)
@@ -267,7 +267,7 @@ class DoraEnv(BaseEnv):
         return super().step(action)
 
     def _step_action(self, action: Any) -> Any:
-        action = checked_action(action, self.single_action_space, self.num_envs, self.device)
+        action = checked_action(self.arms.joined(action), self.single_action_space, self.num_envs, self.device)
         step = self._elapsed_steps
         self.task.remember(self.snapshot)
         command = None
@@ -380,17 +380,16 @@ class DoraEnv(BaseEnv):
         """Simulator, controller and task state; a round trip restores stage and observation."""
         return saved_state(self, cast(dict[str, Any], super().get_state_dict()))  # annotated as a tensor
 
-    def set_state_dict(self, state: dict, env_idx: Tensor | None = None) -> None:
+    def set_state_dict(self, state: Any, env_idx: Any = None) -> None:
         """Inverse of `get_state_dict`; with `env_idx` (b,) the state has b rows.
 
         Where the state's objects have another size, the scene is built anew with those sizes.
         """
-        rows = torch.arange(self.num_envs, device=self.device) if env_idx is None else env_idx
-        resize(self, state, rows)
-        partial = {} if env_idx is None else {"env_idx": env_idx}
-        super().set_state_dict({k: state[k] for k in ("actors", "articulations")}, **partial)
-        restore(self, state, rows)
-        self._snapshot = None
+        set_rows(self, super().set_state_dict, state, env_idx)
+
+    def set_state(self, state: Any, env_idx: Any = None) -> None:
+        """Inverse of `get_state`: rows (n, s), or (b, s) with `env_idx` (b,)."""
+        self.set_state_dict(unflattened(self, state, env_idx), env_idx)
 
     def __str__(self) -> str:
         """The tables in force: stages, terms with weights, observations, limits, numbers."""

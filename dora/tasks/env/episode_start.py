@@ -5,10 +5,52 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from torch import Tensor
+
+from dora.arguments import checked_rows, checked_seeds
+from dora.sim.batch.resets import START, checked_options
 
 SCALE_DRAW = 256
 """Which number of an environment's stream is its size [1]: episodes begin with the same numbers, and use fewer."""
+
+
+def requested(env: Any, seed: Any, options: Any) -> tuple[int | list[int] | None, dict[str, Any]]:
+    """Seeds and options of a reset in the form that ManiSkill takes; in a partial one the seeds are sown already.
+
+    Args:
+        env: the environment.
+        seed: one, or one for each environment that is reset.
+        options: as of `DoraEnv.reset`, or None.
+
+    Raises:
+        InputError: as `dora.arguments.checked_seeds` and `dora.sim.batch.resets.checked_options`.
+    """
+    given, options = options, checked_options(options, env.num_envs, env.device)
+    rows = options.get("env_idx", range(env.num_envs))
+    seeds = checked_seeds(seed, len(rows))
+    if "env_idx" in options and isinstance(seeds, list) and len(seeds) == len(rows):
+        order = checked_rows(given["env_idx"], env.num_envs).argsort().tolist()
+        seeds = [seeds[k] for k in order]
+    if len(rows) < env.num_envs:
+        if seeds is not None and len(rows) > 0:
+            _sow(env, options["env_idx"].tolist(), [seeds] if isinstance(seeds, int) else seeds)
+        return None, options
+    if seeds is not None and START not in options:
+        options["reconfigure"] = True
+    return seeds, options
+
+
+def _sow(env: Any, rows: list[int], seeds: list[int]) -> None:
+    """Gives some environments random streams of their own seeds; one seed gives further ones, as in ManiSkill."""
+    if len(seeds) < len(rows):
+        more = BatchedRNG.from_seeds(seeds).rngs[0].randint(2**31, size=len(rows) - 1)
+        seeds = [*seeds, *more.tolist()]
+    env._main_seed, env._episode_seed = np.array(env._main_seed), env._episode_seed.copy()
+    for streams in (env._batched_main_rng, env._batched_episode_rng):
+        streams[rows] = BatchedRNG.from_seeds(seeds).rngs
+    env._main_seed[rows] = env._episode_seed[rows] = seeds
+    env._main_rng, env._episode_rng = env._batched_main_rng[0], env._batched_episode_rng[0]
 
 
 def drawn_sizes(env: Any, objects: int) -> Float[Tensor, "n objects"]:

@@ -1,21 +1,26 @@
 """The options that every Dora task takes, checked before anything is built."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from mani_skill.agents.registration import REGISTERED_AGENTS
 
+from dora.affordance.candidates import GraspCandidates
 from dora.configs import check_finite, check_not_negative, overridden
 from dora.errors import InputError
 from dora.robot import available_robots
+from dora.sim.batch.hooks import STATE_MODES
 from dora.sim.batch.rendering import can_render
 from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot
 from dora.sim.robots import register_robot
 from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import guidance_in_force
 from dora.tasks.mdp.randomisation import find_preset
+
+STATE_MODES_OR_DEFAULT = (None, *STATE_MODES)
+"""Observation modes that need no pictures, with that of a task that is asked for none."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,7 @@ class TaskOptions:
     render_backend: str
 
 
-def task_config(cls: type[TaskConfig], preset: str, changes: Mapping[str, Any] | TaskConfig | None) -> TaskConfig:
+def task_config(cls: type[TaskConfig], preset: str, changes: Any) -> TaskConfig:
     """The numbers of a task: its own, the preset's randomisation, then `changes`.
 
     Raises:
@@ -60,12 +65,12 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Mapping[str, Any] |
 
 def check_options(
     guidance: str,
-    guidance_parts: Sequence[str] | None,
+    guidance_parts: Any,
     hand_joints: int,
     config: TaskConfig,
     robot_uids: Any,
     arms: int,
-    num_envs: int,
+    num_envs: Any,
     control_mode: str | None,
     sim_backend: str,
     render_backend: str,
@@ -101,6 +106,16 @@ def check_options(
     return TaskOptions(parts, config, robots, mode, sim_backend, render_backend)
 
 
+def check_grasps(grasps: Any, arms: Sequence[str]) -> None:
+    """Refuses `grasps` of a task that are no candidates, or of a task with several arms."""
+    if grasps is None:
+        return
+    if not isinstance(grasps, GraspCandidates):
+        raise InputError(f"grasps must be GraspCandidates, such as GraspCandidates.load(path), not {grasps!r}")
+    if len(arms) > 1:
+        raise InputError(f"grasps are of one arm, and there are {', '.join(arms)}: leave them out")
+
+
 def _robots(robot_uids: Any, arms: int) -> tuple[str, ...]:
     """Names of the robots of `arms` arms, registered with ManiSkill; one name stands for all."""
     names = robot_uids if isinstance(robot_uids, tuple | list) else (robot_uids,) * arms
@@ -118,16 +133,22 @@ def _robots(robot_uids: Any, arms: int) -> tuple[str, ...]:
 
 
 def choose_render_backend(render_mode: str | None, obs_mode: str | None) -> str:
-    """The render backend for a task: "none" unless a picture can be asked for.
+    """The render backend for a task: "none" unless a picture can be asked for and there is a Vulkan driver.
+
+    ManiSkill's tools ask for a `render_mode` whether they draw or not, so that one alone is no reason to refuse, but
+    for "human"; `render` does where nothing can be drawn.
 
     Raises:
-        InputError: if one can be asked for and there is no Vulkan driver.
+        InputError: if observations are pictures or a window is wanted, and there is no Vulkan driver.
     """
-    if render_mode is None and obs_mode in (None, "state", "state_dict", "none"):
+    if render_mode is None and obs_mode in STATE_MODES_OR_DEFAULT:
         return "none"
-    if not can_render():
+    if can_render():
+        return "gpu" if torch.cuda.is_available() else "cpu"
+    if obs_mode not in STATE_MODES_OR_DEFAULT or render_mode == "human":
+        wish = 'render_mode "human"' if render_mode == "human" else f"obs_mode {obs_mode!r}"
         raise InputError(
-            "rendering was asked for, but SAPIEN finds no Vulkan driver: install one (docs/rendering.md), or leave "
-            'render_mode at None and obs_mode at "state"'
+            f"{wish} needs pictures, but SAPIEN finds no Vulkan driver: install one "
+            '(docs/rendering.md), or leave render_mode at None and obs_mode at "state"'
         )
-    return "gpu" if torch.cuda.is_available() else "cpu"
+    return "none"

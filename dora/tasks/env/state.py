@@ -1,9 +1,17 @@
 """Saving and restoring what a task remembers beside the simulator: memory, stages, guides, noise, sizes."""
 
+import copy
+from collections.abc import Callable, Iterator, Mapping
+from math import prod
 from typing import Any
 
 import torch
+from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from torch import Tensor
+
+from dora.arguments import as_tensor, checked_rows, taken, tensors
+from dora.errors import InputError
+from dora.sim.batch.resets import KINDS, rows_of
 
 
 def remembered(env: Any) -> dict[str, Any]:
@@ -20,6 +28,108 @@ def saved_state(env: Any, simulator: dict[str, Any]) -> dict[str, Any]:
     return simulator | {name: {k: v.flatten(min(1, v.ndim - 1)) for k, v in part.items()} for name, part in own.items()}
 
 
+def checked_state(env: Any, state: Any, rows: Tensor) -> dict[str, Any]:
+    """A state as tensors with a row for each of the environments `rows`, from arrays or lists, or from one row for all.
+
+    Raises:
+        InputError: something is missing, or has another shape than in this environment.
+    """
+    if not isinstance(state, Mapping):
+        raise InputError(f"the state must be a dictionary as of get_state_dict, not {type(state).__name__}.")
+    needed = [*KINDS, *(["task", *remembered(env)] if "task" in state else [])]
+    given = {name: state[name] for name in (*needed, "controller") if name in state}
+    if lacking := [name for name in needed if name not in given]:
+        raise InputError(
+            f"the state lacks {lacking[0]!r}: it has to be one of {type(env).__name__} with these options."
+        )
+    return _fitted(tensors(given, "state", env.device), env._init_raw_state, len(rows), "state")
+
+
+def _fitted(state: dict[str, Any], like: Mapping[str, Any], count: int, what: str) -> dict[str, Any]:
+    out = {}
+    for name, part in like.items():
+        path = f"{what}[{name!r}]"
+        if name not in state:
+            if what != "state":  # whole parts may be missing, as in states of the simulator alone
+                raise InputError(f"{path} is missing: the state has to be one of this task with these options.")
+        elif isinstance(part, Mapping):
+            if not isinstance(state[name], dict):
+                raise InputError(f"{path} must be a dictionary with {', '.join(part)}.")
+            out[name] = _fitted(state[name], part, count, path)
+        else:
+            out[name] = _rows(state[name], part, count, path)
+    return out
+
+
+def _rows(values: Tensor, like: Tensor, count: int, what: str) -> Tensor:
+    """Values (count, size) or (count,) as in the state `like`, which has a row for each environment."""
+    if like.ndim == 1:
+        values = values.reshape(-1, 1)
+    return rows_of(values, count, prod(like.shape[1:]), what).reshape(count, *like.shape[1:]).to(like.dtype)
+
+
+def set_rows(env: Any, simulator: Callable[..., None], state: Any, env_idx: Any) -> None:
+    """What `DoraEnv.set_state_dict` does.
+
+    Args:
+        env: the environment.
+        simulator: ManiSkill's `set_state_dict`, for the simulator alone.
+        state: rows as of `get_state_dict`, or one for all.
+        env_idx: environments, or None for all.
+
+    Raises:
+        InputError: as `dora.arguments.checked_rows` and `checked_state`.
+    """
+    rows = _chosen(env, env_idx)
+    if len(rows) == 0:
+        return
+    order = rows.argsort()  # in which ManiSkill writes rows
+    rows, state = rows[order], taken(checked_state(env, state, rows), order)
+    resize(env, state, rows)
+    partial = {} if env_idx is None else {"env_idx": rows}
+    simulator({kind: state[kind] for kind in KINDS}, **partial)
+    restore(env, state, rows)
+    env._snapshot = None
+
+
+def _chosen(env: Any, env_idx: Any) -> Tensor:
+    return checked_rows(slice(None) if env_idx is None else env_idx, env.num_envs, env.device)
+
+
+def unflattened(env: Any, flat: Any, env_idx: Any) -> dict[str, Any]:
+    """The state dictionary of rows as of `get_state`, or of those of the simulator alone (as ManiSkill reads them).
+
+    Args:
+        env: the environment.
+        flat: (count, size) numbers, or (size,).
+        env_idx: environments, or None for all.
+
+    Raises:
+        InputError: the rows have another length.
+    """
+    rows = as_tensor(flat, "the state", env.device)
+    like = env._init_raw_state
+    simulator = {kind: like[kind] for kind in KINDS}
+    short = sum(_width(leaf) for leaf in _leaves(simulator))
+    like = simulator if rows.ndim and rows.shape[-1] == short else like
+    widths = [_width(leaf) for leaf in _leaves(like)]
+    columns = rows_of(rows, len(_chosen(env, env_idx)), sum(widths), "the state").split(widths, -1)
+    return _filled(like, iter(columns))
+
+
+def _width(leaf: Tensor) -> int:
+    return prod(leaf.shape[1:])
+
+
+def _leaves(state: Mapping[str, Any]) -> Iterator[Tensor]:
+    for part in state.values():
+        yield from _leaves(part) if isinstance(part, Mapping) else [part]
+
+
+def _filled(like: Mapping[str, Any], columns: Iterator[Tensor]) -> dict[str, Any]:
+    return {name: _filled(p, columns) if isinstance(p, Mapping) else next(columns) for name, p in like.items()}
+
+
 def restore(env: Any, state: dict, rows: Tensor) -> None:
     """Inverse of `saved_state` for the environments `rows` (b,), whose simulator has been restored: controllers and,
     if it holds them, the task's parts."""
@@ -28,6 +138,8 @@ def restore(env: Any, state: dict, rows: Tensor) -> None:
             if arm.agent.commands_wrist:
                 own = state["controller"] if len(env.arms) == 1 else state["controller"][f"{arm.agent.uid}-{k}"]
                 arm.agent.wrist_controller.restore(own["target"], rows)
+                if env.resetting:  # ManiSkill resets controllers after it has restored the state
+                    arm.agent.wrist_controller.expect_reset(torch.zeros_like(env.scene._reset_mask))
     if "task" in state:
         env._elapsed_steps[rows] = state["task"]["elapsed"].reshape(-1).to(env._elapsed_steps.dtype)
         for name, part in remembered(env).items():
@@ -37,15 +149,29 @@ def restore(env: Any, state: dict, rows: Tensor) -> None:
 
 def resize(env: Any, state: dict, rows: Tensor) -> None:
     """Builds the scene anew if the objects of a state have other sizes than those in the environments `rows`; keeps
-    everybody's state."""
+    everybody's state and, within a reset, everybody's random numbers."""
     if "task" not in state:
         return
     scale = state["task"]["scale"].reshape(len(rows), -1)
     if torch.equal(env.scale[rows], scale):
         return
     keep = env.get_state_dict()
+    streams = _streams(env)
     sizes = env.scale.clone()
     sizes[rows] = scale
     env.rebuild(sizes)
     keep["task"]["scale"] = sizes
     env.set_state_dict(keep)
+    if env.resetting:
+        env._batched_main_rng, env._batched_episode_rng, env._episode_seed = streams
+        env._episode_rng = env._batched_episode_rng[0]
+        env._last_obs = env.get_obs(env.get_info())
+
+
+def _streams(env: Any) -> tuple[BatchedRNG, BatchedRNG, Any]:
+    """Copies of the random streams of all environments, and their seeds."""
+    main, episode = (
+        BatchedRNG.from_rngs([copy.deepcopy(stream) for stream in streams.rngs])
+        for streams in (env._batched_main_rng, env._batched_episode_rng)
+    )
+    return main, episode, env._episode_seed.copy()

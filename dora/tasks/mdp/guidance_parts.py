@@ -5,7 +5,8 @@ grasps      candidates of a search that knows no region, as prior, filter, obser
 affordance  candidates that hold the target region, and that region in observation and reward
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection
+from typing import Any
 
 from dora.errors import InputError
 
@@ -18,7 +19,7 @@ REGION = "region"
 """In force with `guidance="affordance"`: candidates, observation and reward know the object's regions."""
 
 
-def guidance_in_force(guidance: str, parts: Sequence[str] | None) -> frozenset[str]:
+def guidance_in_force(guidance: str, parts: Any) -> frozenset[str]:
     """The parts of guidance that a task has: all of them, or those that are named, and `REGION` where affordances are
     used; none with `guidance="none"`.
 
@@ -31,6 +32,8 @@ def guidance_in_force(guidance: str, parts: Sequence[str] | None) -> frozenset[s
         if parts:
             raise InputError('guidance="none" has no parts; leave guidance_parts out, or choose guidance="affordance"')
         return frozenset()
+    if not (parts is None or isinstance(parts, str | Collection)):
+        raise InputError(f"guidance_parts must be a list of {', '.join(PARTS)}, not {parts!r}")
     named = PARTS if parts is None else (parts,) if isinstance(parts, str) else tuple(parts)
     if unknown := set(named) - set(PARTS):
         raise InputError(f"unknown guidance part {sorted(unknown)[0]!r}; choose among {', '.join(PARTS)}")

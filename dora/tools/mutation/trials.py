@@ -49,6 +49,8 @@ def copied(root: Path, target: Path) -> Path:
     Raises:
         InputError: `root` is no checkout.
     """
+    if shutil.which("git") is None:
+        raise InputError("git is not installed, and it lists the files that are copied: install it.")
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=root, capture_output=True, text=True)
     names = [name for name in listed.stdout.split("\0") if name and (root / name).is_file()]
     if listed.returncode or not names:

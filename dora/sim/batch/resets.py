@@ -1,0 +1,181 @@
+"""Resets and states of environments on `physx_cpu_batch`: arguments in any form, and controllers row by row."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import torch
+from jaxtyping import Int
+from mani_skill.utils import common
+from torch import Tensor
+
+from dora.arguments import as_tensor, checked_rows, checked_seeds, is_mask, suggestion, tensors
+from dora.errors import InputError
+
+START, STATES = "reset_to_env_states", "env_states"
+"""Option of `reset` with states in which episodes begin, and its entry for them."""
+KINDS = ("actors", "articulations")
+"""Parts of a state that ManiSkill restores."""
+
+
+def checked_options(options: Any, count: int, device: torch.device) -> dict[str, Any]:
+    """Options of `reset` with `env_idx` as whole numbers and states as tensors; the given ones stay as they are.
+
+    Args:
+        options: as of ManiSkill's `reset`, or None. With a mask as `env_idx`, states may have a row for each
+            environment, of which those of the mask are used. ManiSkill writes rows in ascending order whatever
+            `env_idx` says, so it becomes ascending, and states are put in that order.
+        count: how many environments there are.
+        device: where tensors are wanted.
+
+    Raises:
+        InputError: the options, `env_idx` or the states are of another kind.
+    """
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise InputError(f"the options of reset must be a dictionary, not {options!r}.")
+    out = {name: value for name, value in options.items() if not (name in ("env_idx", START) and value is None)}
+    mask = order = None
+    if "env_idx" in out:
+        rows = checked_rows(out["env_idx"], count, device)
+        mask = rows if is_mask(out["env_idx"]) else None
+        out["env_idx"], order = rows.sort()
+    if START in out:
+        start = out[START]
+        if not isinstance(start, Mapping) or STATES not in start:
+            raise InputError(f"options[{START!r}] must be a dictionary with {STATES!r} and perhaps 'obs'.")
+        given = {name: tensors(value, name, device) for name, value in start.items() if value is not None}
+        out[START] = {name: _in_order(_of_mask(value, mask, count), order) for name, value in given.items()}
+    return out
+
+
+def _in_order(state: Any, order: Tensor | None) -> Any:
+    """A state whose rows are put in another order, as far as it has so many; one row stands for all."""
+    if isinstance(state, dict):
+        return {name: _in_order(part, order) for name, part in state.items()}
+    return state if order is None or state.ndim == 0 or len(state) != len(order) else state[order]
+
+
+def _of_mask(state: Any, rows: Tensor | None, count: int) -> Any:
+    """The rows of a mask of a state that has a row for each environment."""
+    if isinstance(state, dict):
+        return {name: _of_mask(part, rows, count) for name, part in state.items()}
+    return state if rows is None or state.ndim == 0 or len(state) != count else state[rows]
+
+
+def nothing_reset(env: Any) -> tuple[Any, dict[str, Any]]:
+    """What `reset` of no environment returns: the present observation and info."""
+    info = env.get_info()
+    return env.get_obs(info), info | {"reconfigure": False}
+
+
+def reset(original: Callable, env: Any, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+    """ManiSkill's `reset` with seeds and options in any form.
+
+    A partial reset leaves the controllers' targets of the other environments as they are, and states restore those
+    that they hold.
+    """
+    options, seeds = checked_options(options, env.num_envs, env.device), checked_seeds(seed, env.num_envs)
+    rows, start = options.get("env_idx"), options.get(START, {})
+    if rows is not None and len(rows) == 0:
+        return nothing_reset(env)
+    if "obs" in start:  # ManiSkill writes into the observation that it returned last
+        env._last_obs = common.torch_clone_dict(env._last_obs)
+    states = start.get(STATES)
+    targets = states.get("controller", {}) if isinstance(states, dict) else {}
+    with _controllers_of(env, rows, targets):
+        return original(env, seed=seeds, options=options)
+
+
+@contextmanager
+def _controllers_of(env: Any, rows: Tensor | None, targets: Mapping[str, Any]) -> Iterator[None]:
+    """Context in which `reset` of the controllers is about some environments, and then restores their targets."""
+    agent = getattr(env, "agent", None)
+    if agent is None or (rows is None and not targets):
+        yield
+        return
+    rows = torch.arange(env.num_envs, device=env.device) if rows is None else rows
+    several = isinstance(agent.controller, dict)
+    controllers = agent.controller if several else {"": agent.controller}
+    for uid, controller in controllers.items():
+        own = targets.get(uid, {}) if several else targets
+        controller.reset = partial(_reset_controller, controller, controller.reset, env, rows, own)
+    try:
+        yield
+    finally:
+        for controller in controllers.values():
+            vars(controller).pop("reset", None)
+
+
+def _reset_controller(
+    controller: Any, original: Callable[[], None], env: Any, rows: Int[Tensor, " b"], targets: Mapping[str, Any]
+) -> None:
+    scene = env.scene
+    kept, scene._reset_mask = scene._reset_mask, torch.zeros_like(scene._reset_mask)
+    scene._reset_mask[rows] = True
+    try:
+        original()
+    finally:
+        scene._reset_mask = kept
+    if targets:
+        controller.set_state(_merged(controller.get_state(), targets, rows))
+
+
+def _merged(state: Mapping[str, Any], new: Mapping[str, Any], rows: Tensor) -> dict[str, Any]:
+    """A state of controllers with some rows replaced by those of another one, as far as it has them."""
+    out = dict(state)
+    for name in state.keys() & new.keys():
+        if isinstance(state[name], Mapping):
+            out[name] = _merged(state[name], new[name], rows)
+        else:
+            out[name] = state[name].clone()
+            out[name][rows] = new[name].reshape(-1, *state[name].shape[1:])
+    return out
+
+
+# ---- states --------------------------------------------------------------------------------------
+
+
+def set_state_dict(original: Callable, env: Any, state: Any, env_idx: Any = None) -> None:
+    """ManiSkill's `set_state_dict` with arrays, lists or tensors, for all environments or for those of `env_idx`."""
+    rows = None if env_idx is None else checked_rows(env_idx, env.num_envs, env.device)
+    if not isinstance(state, Mapping):
+        raise InputError(f"the state must be a dictionary as of get_state_dict, not {type(state).__name__}.")
+    state = tensors(state, "state", env.device)
+    count = env.num_envs if rows is None else len(rows)
+    rows, order = (None, slice(None)) if rows is None else rows.sort()
+    for kind in KINDS:
+        known = getattr(env.scene.state_dict_registry, kind)
+        for name, values in state.get(kind, {}).items():
+            if name not in known:
+                raise InputError(f"the state has {kind} {name!r}, which the scene has not: {suggestion(name, known)}")
+            size = 13 if kind == "actors" else 13 + 2 * known[name].max_dof
+            everywhere = len(known[name]._objs) == env.num_envs
+            shape = count if everywhere else len(values), size
+            state[kind][name] = rows_of(values, *shape, f"state[{kind!r}][{name!r}]")[order if everywhere else ...]
+    if count:
+        original(env, state, *(() if rows is None else (rows,)))
+
+
+def rows_of(values: Tensor, count: int, size: int, what: str) -> Tensor:
+    """Values of `count` environments as (count, size); one row, or one without the first axis, stands for all.
+
+    Raises:
+        InputError: if they have another shape.
+    """
+    rows = values[None] if values.ndim == 1 else values
+    if rows.ndim != 2 or rows.shape[1] != size or len(rows) not in (1, count):
+        raise InputError(f"{what} has shape {tuple(values.shape)} but {(count, size)} is needed.")
+    return rows.expand(count, size)
+
+
+def set_state(original: Callable, env: Any, state: Any, env_idx: Any = None) -> None:
+    """ManiSkill's `set_state` with an array, lists or a tensor: a row as of `get_state` for each environment."""
+    rows = None if env_idx is None else checked_rows(env_idx, env.num_envs, env.device)
+    flat = as_tensor(state, "state", env.device)
+    needed = sum(values.shape[-1] for kind in KINDS for values in env._init_raw_state[kind].values())
+    whole = env.get_state().shape[1]
+    size = needed if flat.ndim and flat.shape[-1] == needed else whole
+    original(env, rows_of(flat, env.num_envs if rows is None else len(rows), size, "the state"), rows)

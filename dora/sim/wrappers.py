@@ -1,0 +1,168 @@
+"""ManiSkill's wrappers and recordings, where they need to know of environments that are Dora's or run batched."""
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable, Mapping
+from functools import wraps
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill import logger
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils import common, tree
+from mani_skill.utils.registration import TimeLimitWrapper
+from mani_skill.utils.wrappers import record
+from mani_skill.utils.wrappers.cached_reset import CachedResetWrapper
+from mani_skill.utils.wrappers.record import RecordEpisode
+
+from dora.arguments import as_tensor
+from dora.configs import plain
+from dora.errors import InputError
+from dora.sim.batch.hooks import BACKEND
+from dora.sim.batch.resets import checked_options
+from dora.sim.robot_agent import DescribedRobot
+
+PACKAGE = "dora"
+"""Name of this package, which an id such as "dora:PickCube-v1" imports."""
+FORWARDED = ("num_envs", "single_action_space", "single_observation_space")
+"""Attributes of the environment that `ManiSkillSB3VectorEnv` reads from what `gym.make` returns."""
+
+_installed = False
+
+
+def install_wrappers() -> None:
+    """Wrap what this module mends in ManiSkill; further calls do nothing."""
+    global _installed
+    if _installed:
+        return
+    for owner, name, wrapper in (
+        (record, "parse_env_info", _env_info),
+        (RecordEpisode, "reset", _reset),
+        (RecordEpisode, "step", _step),
+        (common, "_batch", _batch),
+        (CachedResetWrapper, "__init__", _cache),
+        (BaseEnv, "render", _render),
+    ):
+        original = getattr(owner, name)
+        setattr(owner, name, wraps(original)(wrapper(original)))
+    for name in FORWARDED:
+        setattr(TimeLimitWrapper, name, property(lambda self, name=name: self.env.get_wrapper_attr(name)))
+    _installed = True
+
+
+# ---- how a recording says what it is of ----------------------------------------------------------
+
+
+def opening_module(env: BaseEnv) -> str | None:
+    """The module whose import makes an environment known to gymnasium; None if ManiSkill alone does.
+
+    It is this package for its own tasks and robots and for everything on `physx_cpu_batch`, and otherwise the module
+    where a user's task is defined.
+    """
+    agents = getattr(env.agent, "agents", [env.agent])
+    module = type(env).__module__
+    ours = [cls for cls in type(env).__mro__ if cls.__module__.split(".")[0] == PACKAGE]
+    if ours and module.split(".")[0] not in (PACKAGE, "mani_skill", "__main__"):
+        return module
+    described = any(isinstance(agent, DescribedRobot) for agent in agents)
+    return PACKAGE if ours or described or env.backend.sim_backend == BACKEND else None
+
+
+def _env_info(original: Callable) -> Callable:
+    def parse_env_info(env: Any) -> dict[str, Any] | None:
+        """ManiSkill's entry with an id that opens by itself, such as "dora:DoraCube-v1", the back end in use, and
+        arguments that JSON can hold."""
+        info, base = original(env), env.unwrapped
+        if info is None or (module := opening_module(base)) is None:
+            return info
+        kwargs = info["env_kwargs"] | {"sim_backend": base.backend.sim_backend}
+        env_id = info["env_id"] if ":" in info["env_id"] else f"{module}:{info['env_id']}"
+        return info | {"env_id": env_id, "env_kwargs": _jsonable(kwargs)}
+
+    return parse_env_info
+
+
+def _jsonable(kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    out = {}
+    for name, value in kwargs.items():
+        try:
+            out[name] = _plain(value)
+        except TypeError:
+            logger.warning(f"The recording does not hold the argument {name!r}, which is a {type(value).__name__}.")
+    return out
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON has it; TypeError if it has no such form."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(part) for name, part in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_plain(part) for part in value]
+    if isinstance(value, np.generic | np.ndarray | torch.Tensor):
+        return value.tolist()
+    if dataclasses.is_dataclass(value) and not any(isinstance(part, torch.Tensor) for part in vars(value).values()):
+        return _plain(plain(value))
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    json.dumps(value)
+    return value
+
+
+def _render(original: Callable) -> Callable:
+    def render(self: BaseEnv, *args: Any, **kwargs: Any) -> Any:
+        """ManiSkill's, or an InputError where nothing can be drawn."""
+        if self.render_mode not in (None, "human") and not self.scene.can_render() and _is_ours(self):
+            raise InputError(
+                "nothing can be rendered: SAPIEN finds no Vulkan driver (see docs/rendering.md), or render_backend is "
+                f"{self.backend.render_backend!r}."
+            )
+        return original(self, *args, **kwargs)
+
+    return render
+
+
+# ---- recording -----------------------------------------------------------------------------------
+
+
+def _is_ours(env: Any) -> bool:
+    return opening_module(env.unwrapped) is not None
+
+
+def _reset(original: Callable) -> Callable:
+    def reset(self: RecordEpisode, *args: Any, seed: Any = None, options: Any = None, **kwargs: Any) -> Any:
+        """ManiSkill's, with seeds and `env_idx` in any form."""
+        if _is_ours(self):
+            options = checked_options(options, self.num_envs, self.base_env.device) or None
+            seed = seed.tolist() if isinstance(seed, np.generic | np.ndarray | torch.Tensor) else seed
+        return original(self, *args, seed=seed, options=options, **kwargs)
+
+    return reset
+
+
+def _step(original: Callable) -> Callable:
+    def step(self: RecordEpisode, action: Any) -> Any:
+        """ManiSkill's, with actions in any form, which it stores as arrays."""
+        if _is_ours(self) and action is not None and not isinstance(action, Mapping):
+            action = as_tensor(action, "the action")
+        return original(self, action)
+
+    return step
+
+
+def _batch(original: Callable) -> Callable:
+    def batch(array: Any) -> Any:
+        """ManiSkill's; numbers of numpy get two axes as those of Python do."""
+        return np.array([[array]]) if isinstance(array, np.generic) and np.ndim(array) == 0 else original(array)
+
+    return batch
+
+
+def _cache(original: Callable) -> Callable:
+    def init(self: CachedResetWrapper, *args: Any, **kwargs: Any) -> None:
+        """ManiSkill's, which counts whole batches even where it stores a part of the last one."""
+        original(self, *args, **kwargs)
+        self._num_cached_resets = tree.shape(self._cached_resets_env_states, first_only=True)[0]
+
+    return init

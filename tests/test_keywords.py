@@ -1,0 +1,138 @@
+"""Keywords of gym.make: typos and values out of range get one sentence, and the back end is what was asked for."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.structs.types import SimConfig
+
+import dora.sim
+from dora.errors import InputError
+
+WRONG = [
+    ({"num_env": 4}, "did you mean 'num_envs'"),
+    ({"num_envs": 0}, "at least 1"),
+    ({"num_envs": -1}, "at least 1"),
+    ({"num_envs": 2.5}, "whole number"),
+    ({"num_envs": True}, "whole number"),
+    ({"num_envs": "4"}, "whole number"),
+    ({"sim_backend": "physx_cpu_bach"}, "did you mean 'physx_cpu_batch'"),
+    ({"sim_backend": 3}, "must be a text"),
+    ({"sim_backend": None}, "must be a text"),
+    ({"sim_backend": "physx_cpu:1"}, "no sim_backend"),
+    ({"render_backend": "gpuu"}, "did you mean 'gpu'"),
+    ({"render_backend": 3}, "must be a text"),
+    ({"obs_mode": "stat"}, "did you mean 'state'"),
+    ({"obs_mode": 3}, "must be a text"),
+    ({"obs_mode": "rgb+dept"}, "did you mean 'depth'"),
+    ({"reward_mode": "dens"}, "did you mean 'dense'"),
+    ({"control_mode": "pd_joint_po"}, "pd_joint_pos"),
+    ({"control_mode": 3}, "must be a text"),
+    ({"render_mode": "rgb"}, "choose one of human"),
+    ({"shader_dir": "ray"}, "choose one of minimal"),
+    ({"enable_shadow": "yes"}, "True or False"),
+    ({"enhanced_determinism": "maybe"}, "True or False"),
+    ({"parallel_in_single_scene": True}, "not available"),
+    ({"sensor_configs": 3}, "dictionary"),
+    ({"human_render_camera_configs": [1]}, "dictionary"),
+    ({"viewer_camera_configs": "x"}, "dictionary"),
+    ({"reconfiguration_freq": -1}, "must be 0"),
+    ({"reconfiguration_freq": 1.5}, "whole number"),
+    ({"sim_config": 3}, "dictionary"),
+    ({"sim_config": {"sim_frq": 100}}, "did you mean 'sim_freq'"),
+    ({"sim_config": {"sim_freq": 0}}, "too small"),
+    ({"sim_config": {"control_freq": -20}}, "too small"),
+    ({"sim_config": {"sim_freq": 100.5}}, "whole number"),
+    ({"sim_config": {"sim_freq": 110}}, "a multiple of the control_freq, 20 Hz"),
+    ({"sim_config": {"scene_config": {"enable_pmc": False}}}, "did you mean 'enable_pcm'"),
+    ({"sim_config": {"scene_config": {"contact_offset": float("nan")}}}, "finite number"),
+]
+"""Arguments that are wrong for every task, and words of the answer."""
+OURS = [
+    ({"num_envs": 3, "sim_backend": "physx_cpu"}, "use 'physx_cpu_batch' for 3"),
+    ({"guidance": 3}, "must be a text"),
+    ({"guidance": None}, "must be a text"),
+    ({"guidance_parts": 3}, "must be a list"),
+    ({"guidance_parts": ["filtr"]}, "filter"),
+    ({"hand_joints": "20"}, "whole number"),
+    ({"preset": None}, "must be a text"),
+    ({"config": 3}, "config must be a mapping"),
+    ({"grasps": "grasps.safetensors"}, "GraspCandidates.load"),
+    ({"robot_uids": 3}, "robot_uids"),
+    ({"robot_uids": ()}, "one robot for each"),
+]
+"""Arguments that are wrong for our tasks."""
+
+
+@pytest.mark.parametrize(("options", "words"), WRONG + OURS, ids=str)
+def test_arguments_of_our_tasks_are_checked_one_by_one(options: dict[str, Any], words: str):
+    with pytest.raises(InputError, match=words) as error:
+        gym.make("DoraCube-v1", **options)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("options", "words"), WRONG, ids=str)
+def test_arguments_of_maniskills_tasks_on_our_back_end_are_checked_as_well(options: dict[str, Any], words: str):
+    with pytest.raises(InputError, match=words) as error:
+        gym.make("PickCube-v1", **{"sim_backend": dora.sim.BACKEND, **options})
+    assert "\n" not in str(error.value)
+
+
+def test_every_keyword_of_maniskill_has_a_wrong_value_here():
+    import inspect
+
+    tried = {name for options, _ in WRONG for name in options} | {"robot_uids"}
+    assert set(inspect.signature(BaseEnv.__init__).parameters) - {"self"} <= tried
+
+
+def test_values_that_are_right_in_another_form_are_taken():
+    env = gym.make(
+        "DoraCube-v1",
+        num_envs=np.int64(2),
+        enable_shadow=np.bool_(False),
+        sensor_configs=None,
+        sim_config=None,
+        render_backend=None,
+        reconfiguration_freq=np.int32(0),
+        reward_mode="paper",
+        obs_mode=None,
+    )
+    assert env.unwrapped.num_envs == 2  # pyright: ignore[reportAttributeAccessIssue]
+    assert env.unwrapped.backend.sim_backend == dora.sim.BACKEND  # pyright: ignore[reportAttributeAccessIssue]
+    settings = SimConfig(sim_freq=60, control_freq=20)
+    whole: Any = gym.make("PickCube-v1", sim_backend=dora.sim.BACKEND, sim_config=settings, render_backend="none")
+    assert whole.unwrapped.sim_freq == 60
+
+
+DEFAULT = """
+import gymnasium as gym, dora
+for env_id in ("PickCube-v1", "PushCube-v1"):
+    env = gym.make(env_id, num_envs=4, render_backend="none")
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    assert env.unwrapped.backend.sim_backend == "physx_cpu_batch"
+assert gym.make("PickCube-v1", render_backend="none").unwrapped.backend.sim_backend == "physx_cpu"
+"""
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="with CUDA ManiSkill's own back end is the default")
+def test_several_environments_without_cuda_run_batched_and_it_is_said_once(project_root: Path):
+    done = subprocess.run([sys.executable, "-c", DEFAULT], cwd=project_root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (done.stdout + done.stderr).count('sim_backend="physx_cpu_batch"') == 1
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="with CUDA the back end is there")
+def test_a_back_end_that_was_asked_for_is_never_replaced():
+    with pytest.raises(RuntimeError, match="multiple environments"):
+        gym.make("PickCube-v1", num_envs=4, sim_backend="physx_cpu")
+    for env_id in ("PickCube-v1", "DoraCube-v1"):
+        for name in ("physx_cuda", "gpu", "cuda:0"):
+            with pytest.raises(InputError, match="needs a GPU with CUDA"):
+                gym.make(env_id, num_envs=4, sim_backend=name)
