@@ -78,12 +78,11 @@ class Imported:
     weighing: Weighing
     notes: tuple[str, ...]
 
-    def lines(self) -> list[str]:
+    def lines(self) -> tuple[str, ...]:
         """Size, mass and notes, a line each."""
         name = self.object.name
-        return [f"{name}: {size_in_words(self.object)}, {self.weighing.sentence()}"] + [
-            f"{name}: {note}" for note in self.notes
-        ]
+        first = f"{size_in_words(self.object)}, {self.weighing.sentence()}"
+        return tuple(f"{name}: {text}" for text in (first, *self.notes))
 
 
 def size_in_words(obj: AffordanceObject) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import importlib
 from dataclasses import dataclass
 from typing import Any
@@ -188,7 +189,8 @@ class GraspPage:
         with self.server.gui.add_folder("Colours"):
             for title, table in rows:
                 boxes = " ".join(
-                    f'<span style="background: rgb{rgb}; border-radius: 3px; padding: 0 0.5em">{name}</span>'
+                    f'<span style="background: rgb{rgb}; border-radius: 3px; padding: 0 0.5em">'
+                    f"{html.escape(name)}</span>"
                     for name, rgb in table.items()
                 )
                 self.server.gui.add_html(f'<div style="padding: 0.3em 1em; line-height: 1.8">{title}: {boxes}</div>')
