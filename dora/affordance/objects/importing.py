@@ -79,10 +79,12 @@ class Imported:
     notes: tuple[str, ...]
 
     def lines(self) -> tuple[str, ...]:
-        """Size, mass and notes, a line each."""
+        """Size and mass, regions, and notes, a line each."""
         name = self.object.name
         first = f"{size_in_words(self.object)}, {self.weighing.sentence()}"
-        return tuple(f"{name}: {text}" for text in (first, *self.notes))
+        pairs = zip(self.object.labels, self.object.classes, strict=True)
+        regions = f"regions {', '.join(f'{label} ({own})' for label, own in pairs)}"
+        return tuple(f"{name}: {text}" for text in (first, regions, *self.notes))
 
 
 def size_in_words(obj: AffordanceObject) -> str:

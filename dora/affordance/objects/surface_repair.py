@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import networkx as nx
 import numpy as np
 import trimesh
 from jaxtyping import Int
 
+from dora.affordance.objects.signed_distance import ExactDistance
 from dora.affordance.objects.solids import unite
 from dora.affordance.objects.surfaces.body_relations import Nesting, loose_parts, nesting
-from dora.affordance.objects.surfaces.face_cleaning import clean
+from dora.affordance.objects.surfaces.face_cleaning import adjacency, clean
 from dora.errors import InputError
 
-MOST_FILLED = 0.53
-"""Largest ratio of the area that closes openings to that of the mesh; a hemispherical bowl needs 0.5 [1]."""
+MOST_FILLED, MOST_FILLED_DEEP = 0.53, 0.65
+"""Largest ratios of the area that closes openings to that of the mesh, of shallow and of deep ones [1]."""
+DEEP = 0.06
+"""Ratio of volume to area^1.5 from which what is closed is deep; half a ball has 0.072, a shallow tray 0.04 [1]."""
 SCRAP = 0.05
 """Share of the area up to which a component that cannot be closed, or is flat, is dropped [1]."""
 MOST_SCRAPS = 0.2
@@ -24,6 +27,8 @@ LEAST_VOLUME = 1e-4
 """Smallest ratio of volume to area^1.5 [1]; a ball has 0.094, a sheet 0."""
 FLAT = 0.015
 """The same ratio below which an open scrap counts as flat [1]; a square bent by a tenth of its side has 0.012."""
+INSIDE = 0.01
+"""Share of the area from which a body inside another is worth a remark [1]."""
 FEWEST_FACES = 4
 """Fewest faces of a closed surface [1]."""
 WIDE = 0.05
@@ -92,12 +97,14 @@ def repair(mesh: trimesh.Trimesh, labels: Int[np.ndarray, " f"], name: str) -> R
     """
     mesh, labels, dropped = clean(mesh, labels)
     bodies, scraps = _bodies(mesh, labels, name)
+    bodies = [_without_buried_openings(body, bodies) for body in bodies]
     found = nesting([(body.mesh, body.sense) for body in bodies])
     outer = [bodies[i] for i in found.outer]
     kept, loose, clusters = loose_parts([body.mesh for body in outer])
     scraps += [outer[i].mesh.area for i in loose]
     outer, cavities = [outer[i] for i in kept], [found.cavities[i] for i in kept]
-    actions = _actions(outer, found, dropped, scraps, mesh.area, clusters)
+    filled = [bodies[i].mesh.area for i in found.filled if bodies[i].mesh.area > INSIDE * mesh.area]
+    actions = _actions(outer, found, dropped, scraps, mesh.area, clusters, len(filled))
     whole = (outer[0].mesh, outer[0].labels) if len(outer) == 1 else _united(outer, name)
     hollow = tuple(tuple(bodies[i].mesh for i in inside) for inside in cavities)
     return Repaired(*whole, actions, tuple(outer), hollow)
@@ -106,7 +113,7 @@ def repair(mesh: trimesh.Trimesh, labels: Int[np.ndarray, " f"], name: str) -> R
 def _bodies(mesh: trimesh.Trimesh, labels: np.ndarray, name: str) -> tuple[list[Body], list[float]]:
     """The connected parts of a surface, closed, and the areas of those that are scraps."""
     bodies, scraps = [], []
-    groups = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1)
+    groups = trimesh.graph.connected_components(adjacency(mesh), nodes=np.arange(len(mesh.faces)), min_len=1)
     for group in groups:
         area = float(mesh.area_faces[group].sum())
         small = area <= SCRAP * mesh.area
@@ -137,18 +144,18 @@ def _bodies(mesh: trimesh.Trimesh, labels: np.ndarray, name: str) -> tuple[list[
 
 
 def _actions(
-    outer: list[Body], found: Nesting, dropped: int, scraps: list[float], area: float, clusters: int
+    outer: list[Body], found: Nesting, dropped: int, scraps: list[float], area: float, clusters: int, inside: int
 ) -> tuple[str, ...]:
     """Descriptions of what was done, without those that do not apply."""
-    mouths, inside = sum(body.mouths for body in outer), len(found.filled)
+    mouths = sum(body.mouths for body in outer)
     cavities = sum(len(each) for each in found.cavities)
     added = sum(body.added for body in outer if body.sheet is not None) / area
     counts = {
         "dropped {} degenerate or double faces": dropped,
         f"dropped {{}} loose scraps of surface ({sum(scraps) / area:.1%} of it)": len(scraps),
         "filled {} holes": sum(body.holes for body in outer),
-        f"closed {{}} wide openings of a surface without thickness (+{added:.0%} of surface): it is treated as solid, "
-        "and hands stay out of it": mouths,
+        f"closed {{}} wide openings of a surface without thickness (+{added:.0%} of surface): it is treated as "
+        "solid, hands stay out of it, and it weighs as a shell": mouths,
         "turned {} bodies outwards": sum(body.turned for body in outer),
         "found {} closed cavities, which weigh nothing and which hands do not enter": cavities,
         "filled {} bodies inside others, whose faces point the same way: turn these if they are cavities": inside,
@@ -170,7 +177,8 @@ def _closed(part: trimesh.Trimesh, labels: np.ndarray, total_area: float, name: 
             "holes touch: repair it in a mesh editor, for instance by remeshing, and try again."
         )
     added = float(body.area - area)
-    if added > MOST_FILLED * total_area:
+    deep = abs(body.volume) > DEEP * body.area**1.5
+    if added > (MOST_FILLED_DEEP if deep else MOST_FILLED) * total_area:
         raise InputError(
             f"{name} is open: closing its holes would add {added / total_area:.0%} to its surface; "
             "give the sheet a thickness or close it in a mesh editor."
@@ -184,6 +192,16 @@ def _closed(part: trimesh.Trimesh, labels: np.ndarray, total_area: float, name: 
     wide = fills.count if added >= WIDE * area else fills.mouths
     sheet = trimesh.Trimesh(body.vertices, body.faces[:count], process=False) if wide else None
     return Body(body, labels, fills.count - wide, wide, added, sheet, turned, sense)
+
+
+def _without_buried_openings(body: Body, bodies: list[Body]) -> Body:
+    """The body, taken for solid if all its openings end inside other bodies, as those of a tube used as a handle."""
+    count = body.holes + body.mouths
+    if body.sheet is None or len(bodies) == 1:
+        return body
+    middles, others = np.array(body.mesh.vertices)[-count:], [each.mesh for each in bodies if each is not body]
+    buried = np.any([ExactDistance(other)(middles) < 0 for other in others], axis=0)
+    return replace(body, sheet=None, holes=count, mouths=0) if buried.all() else body
 
 
 @dataclass(frozen=True)

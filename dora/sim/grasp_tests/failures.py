@@ -26,6 +26,9 @@ FEW = 0.25
 """Share of valid candidates below which the causes are printed with a hint [1]."""
 LIGHT = 0.1
 """Mass below which slips are not put down to the weight [kg]."""
+WIDE = 0.08
+"""Narrowest side above which few fingers reach around [m]: of cylinders 5, 6, 7 and 9 cm wide, .69, .54, .32 and .01 of
+the candidates are valid."""
 MILLIMETRES = 1000.0
 """Millimetres per metre [1]."""
 
@@ -101,10 +104,11 @@ def hint(found: dict[str, Any], obj: AffordanceObject, assumed: bool) -> str:
 
 def _slip_hint(slip: str, obj: AffordanceObject, assumed: bool) -> str:
     """What to do about slips, of which those by the name `slip` are the most frequent."""
-    side = slip.removeprefix("slipped ")
+    side, narrowest = slip.removeprefix("slipped "), float(obj.mesh.extents.min())
     weight = f"the object weighs {obj.mass:.2g} kg"
+    wide = f", or ask for a --region narrower than its {100 * narrowest:.1f} cm" if narrowest > WIDE else ""
     if assumed:
-        return f"most slip {side}: {weight}, which is an estimate; give its mass with --mass."
+        return f"most slip {side}: {weight}, which is an estimate; give its mass with --mass{wide}."
     if obj.mass >= LIGHT:
         return f"most slip {side}: {weight}; if that is right, ask for another --region or for more candidates."
     return f"most slip {side}, although {weight} only: ask for another --region or for more candidates."

@@ -1,4 +1,4 @@
-"""Faces that a surface should not have: degenerate ones, repeated ones, back sides, and walls inside a body."""
+"""Faces that a surface should not have, such as repeated ones and back sides, and which faces are neighbours."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from jaxtyping import Bool, Int
 
 MERGE_SHARE = 1e-6
 """Distance in diagonals of the mesh below which vertices are merged [1]."""
+
+ANGLE_DIGITS = 6
+"""Decimal digits of a turn to which angles between faces are compared."""
 
 
 def clean(mesh: trimesh.Trimesh, labels: Int[np.ndarray, " f"]) -> tuple[trimesh.Trimesh, Int[np.ndarray, " n"], int]:
@@ -31,6 +34,43 @@ def clean(mesh: trimesh.Trimesh, labels: Int[np.ndarray, " f"]) -> tuple[trimesh
     good = proper & _first_of_each(np.take_along_axis(faces, turn, 1))
     good[np.flatnonzero(good)[_superfluous(faces[good])]] = False
     return trimesh.Trimesh(mesh.vertices[kept], faces[good], process=False), labels[good], int((~good).sum())
+
+
+def adjacency(mesh: trimesh.Trimesh) -> Int[np.ndarray, "n 2"]:
+    """Pairs of faces that are neighbours on the surface of one body.
+
+    Edges of two faces give a pair each. At an edge of more faces, where bodies touch, two faces are a pair if there is
+    material between them. Such an edge gives no pair if the faces around it do not alternate in orientation.
+    """
+    edges = mesh.edges_sorted
+    _, edge_of, counts = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    crowded = np.flatnonzero(counts[edge_of.ravel()] > 2)
+    if not len(crowded):
+        return mesh.face_adjacency
+    crowded = crowded[np.argsort(edge_of.ravel()[crowded], kind="stable")]
+    starts = np.flatnonzero(np.diff(edge_of.ravel()[crowded], prepend=-1))
+    outwards = 1 if mesh.volume >= 0 else -1
+    found = [pair for rows in np.split(crowded, starts[1:]) for pair in _around(mesh, rows, outwards)]
+    return np.concatenate([mesh.face_adjacency, np.array(found, np.int64).reshape(-1, 2)])
+
+
+def _around(mesh: trimesh.Trimesh, rows: Int[np.ndarray, " k"], outwards: int) -> list[tuple[int, int]]:
+    """Pairs of faces around one edge, which is given as its `rows` of `mesh.edges`; none if there is no clear order."""
+    faces, (first, second) = mesh.edges_face[rows], mesh.edges_sorted[rows[0]]
+    start = mesh.vertices[first]
+    axis = mesh.vertices[second] - start
+    axis = axis / np.linalg.norm(axis)
+    third = mesh.faces[faces].sum(1) - first - second
+    away = mesh.vertices[third] - start
+    away -= np.outer(away @ axis, axis)
+    side = np.cross(axis, away[0])
+    angle = np.arctan2(away @ side / np.linalg.norm(away[0]), away @ away[0] / np.linalg.norm(away[0]))
+    turns = np.round(angle / (2 * np.pi), ANGLE_DIGITS) % 1
+    ahead = outwards * np.where(mesh.edges[rows, 0] == first, 1, -1)
+    order = np.lexsort((-ahead, turns))
+    if len(rows) % 2 or (ahead[order] + ahead[np.roll(order, 1)]).any():
+        return []
+    return [(int(faces[order[i]]), int(faces[order[i - 1]])) for i in range(len(order)) if ahead[order[i]] == 1]
 
 
 def _first_of_each(rows: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:

@@ -25,7 +25,7 @@ SOLID_DENSITY, WALL_DENSITY = 600.0, 1000.0
 """Assumed densities of solids, that of wood, and of the walls of vessels, that of plastics [kg/m^3]."""
 THINNEST, THICKEST = 0.001, 0.003
 """Range to which the thickness of a wall is limited for the estimate [m]; a sheet counts as `THICKEST`."""
-MASSES = (1e-4, 100.0)
+MASSES = (1e-5, 100.0)
 """Range of a mass that may be given [kg]."""
 DENSITIES = (1.0, 25_000.0)
 """Range of a density that may be given, from aerogel to osmium [kg/m^3]."""
@@ -54,14 +54,14 @@ class Weighing:
         mass: mass [kg].
         kind: what the object is taken for; that of its heaviest body if there are several.
         estimate: material of the estimate in words.
-        assumed: whether the mass is an estimate; otherwise it, or the density, was given.
+        source: what the mass comes from: an "estimate", or the "mass" or "density" that was given.
         weights: closed meshes of uniform density [m] with their masses [kg]; that of a cavity is negative.
     """
 
     mass: float
     kind: Kind
     estimate: str
-    assumed: bool
+    source: Literal["estimate", "mass", "density"]
     weights: tuple[tuple[trimesh.Trimesh, float], ...]
 
     @property
@@ -69,10 +69,15 @@ class Weighing:
         """Centre of mass (3,) [m]."""
         return mass_properties(self.weights)[1]
 
+    @property
+    def assumed(self) -> bool:
+        """Whether the mass is an estimate."""
+        return self.source == "estimate"
+
     def sentence(self) -> str:
         """How heavy the object is and why."""
         if not self.assumed:
-            return f"{self.mass:.3g} kg as given, taken for a {NAMES[self.kind]}"
+            return f"{self.mass:.3g} kg by the {self.source} given, taken for a {NAMES[self.kind]}"
         doubt = ", less if it is hollow" if self.kind == "solid" and self.mass > HEAVY else ""
         return (
             f"{self.mass:.3g} kg assumed{doubt}: taken for a {NAMES[self.kind]}, {self.estimate}; "
@@ -121,7 +126,7 @@ def weigh(repaired: Repaired, mass: float | None = None, density: float | None =
     else:
         parts = [_closed(repaired.mesh, ())]
     estimate = sum(part.mass for part in parts)
-    total = mass or (density * sum(part.volume for part in parts) if density else estimate)
+    total = mass or (density or 0.0) * sum(part.volume for part in parts) or estimate
     weights = [(mesh, part.mass * share * total / estimate) for part in parts for mesh, share in part.meshes]
     heaviest = max(parts, key=lambda part: part.mass)
     material = (
@@ -129,7 +134,8 @@ def weigh(repaired: Repaired, mass: float | None = None, density: float | None =
         if heaviest.kind == "solid"
         else f"walls of {1000 * heaviest.wall:.1f} mm and {WALL_DENSITY:.0f} kg/m^3"
     )
-    return Weighing(float(total), heaviest.kind, material, not (mass or density), tuple(weights))
+    source = "mass" if mass is not None else "density" if density is not None else "estimate"
+    return Weighing(float(total), heaviest.kind, material, source, tuple(weights))
 
 
 def _sheet(sheet: trimesh.Trimesh) -> _Part:
