@@ -28,6 +28,7 @@ from dora.sim.grasp_tests.bundle_maker import make_bundle
 from dora.sim.grasp_tests.failures import hint
 from dora.sim.grasp_tests.generation import baselines, by_region, generate, summary, voting_summary
 from dora.sim.grasp_tests.report import check_out, print_agreement, print_report, write_report
+from dora.tables import show_any_script
 from dora.tools.task_ranking import rank_bundled_set, tasks_of, usable_in_task
 
 INTERRUPTED = 130
@@ -143,7 +144,7 @@ def run(args: Args) -> None:
     print(*wanted.lines, sep="\n", flush=True)
     with ProgressDisplay() as phases:
         generated = generate(obj, robot, args.num, args.seed, region, phases, simulate, kinematics=args.kinematics)
-        report = summary(generated) | {"kinematics": args.kinematics} | about(wanted)
+        report: dict[str, Any] = summary(generated) | {"kinematics": args.kinematics} | about(wanted)
         report["failures"]["hint"] = hint(report["failures"], obj, wanted.assumed)
         searches = {}
         if args.by_region:
@@ -196,6 +197,7 @@ def remake(args: Args) -> None:
 def main() -> int:
     """Run the command; returns the exit status."""
     description = f"{__doc__}\nObjects: {', '.join(available_objects())}."
+    show_any_script()
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=description)
     try:
         if args.make_bundle or args.rank_in_task or args.contact_maps:

@@ -21,6 +21,7 @@ from dora.affordance.objects.folder_writing import write_object_folder
 from dora.affordance.objects.importing import import_mesh
 from dora.affordance.objects.models import cube, hammer, jug, microwave
 from dora.errors import InputError
+from dora.tables import show_any_script
 
 MODELS: dict[str, Callable[[], AffordanceObject]] = {
     "cube": cube.build, "hammer": hammer.build, "jug": jug.build, "microwave": microwave.build,
@@ -84,6 +85,7 @@ def run(args: Args) -> list[Path]:
 
 def main() -> int:
     """Run the command; returns the exit status."""
+    show_any_script()
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     try:
         print(*run(args), sep="\n")
