@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -21,8 +20,8 @@ WHOLE = "body"
 """Label of a mesh without parts, and of faces in no region."""
 WANTED = "handle"
 """Label that is the default target if a mesh has it."""
-COPY = re.compile(r"[\d._ ()-]*\d\)?$")
-"""End of the name of a copy."""
+COPY = "0123456789._ -()"
+"""Characters at the end of the name of a copy."""
 UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn")
 """Unicode categories of characters that do not show, such as byte order marks and marks of direction."""
 NAMELESS, NUMBER = "Region", "No"
@@ -77,7 +76,9 @@ def _tidy(name: str, source: str) -> str:
 
 def without_number(name: str) -> str:
     """A name without the numbers that editors add to copies: "handle.001", "handle_2" and "handle (2)" -> "handle"."""
-    return COPY.sub("", name) or name
+    start = name.rstrip(COPY)
+    end = name[len(start) :]
+    return start if start and end.strip("._ -()") and end[-1] not in "._ -(" else name
 
 
 def grasp_class(label: str) -> str:

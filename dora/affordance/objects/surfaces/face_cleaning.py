@@ -116,6 +116,6 @@ def _superfluous(faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
     return drop | single
 
 
-def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "3f 2"]:
+def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
     """The three edges of every face, each with its lower corner first."""
     return np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
