@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -132,6 +132,7 @@ def import_mesh(
         rest=resting_pose(mesh, weighing.center),
     )
     lost = [name for name in given.names if name not in regions]
+    obj = replace(obj, mass=weighing.mass)  # without the rounding of a sum
     return Imported(obj, weighing, (*repaired.actions, *_doubts(obj, units, lost)))
 
 

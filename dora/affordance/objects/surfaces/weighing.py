@@ -38,7 +38,10 @@ NEAREST = 1.75
 BLOCKED = 0.6
 """Share of the rays that meet the surface from which a point counts as enclosed [1]."""
 SLIM = 1e-3
-"""Least share of a hollow body that is wall; below it the wall counts as without thickness [1]."""
+"""Least share of a hollow body that is wall, below which it counts as without thickness; also the thickness in
+diagonals at which the inertia of a sheet is computed [1]."""
+PRISM = np.array([[0, 1, 2], [5, 4, 3], [0, 3, 1], [1, 3, 4], [1, 4, 2], [2, 4, 5], [2, 5, 0], [0, 5, 3]])
+"""Faces of a prism between a triangle and the same further down."""
 HEAVY = 0.5
 """Assumed mass of a solid above which it is worth a remark that it may be hollow [kg]."""
 NAMES: dict[Kind, str] = {
@@ -196,18 +199,16 @@ def _blocked(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[n
 
 
 def thickened(sheet: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A thin closed body along an open surface, for its centre of mass and inertia alone; its inside may cross itself.
+    """A thin prism below every triangle of an open surface, for its centre of mass and inertia alone.
 
     Args:
-        sheet: open surface with outward faces [m].
+        sheet: f triangles with outward normals [m].
     """
-    count = len(sheet.vertices)
-    inner = sheet.vertices - 1e-3 * sheet.scale * sheet.vertex_normals
-    single = trimesh.grouping.group_rows(sheet.edges_sorted, require_count=1)
-    first, second = sheet.edges[single].T
-    rim = [np.column_stack([second, first, first + count]), np.column_stack([second, first + count, second + count])]
-    faces = np.concatenate([sheet.faces, sheet.faces[:, ::-1] + count, *rim])
-    return trimesh.Trimesh(np.concatenate([sheet.vertices, inner]), faces, process=False)
+    above = sheet.triangles
+    below = above - SLIM * sheet.scale * sheet.face_normals[:, None]
+    corners = np.concatenate([above, below], axis=1).reshape(-1, 3)
+    faces = 6 * np.arange(len(above))[:, None, None] + PRISM
+    return trimesh.Trimesh(corners, faces.reshape(-1, 3), process=False)
 
 
 def _points_in(hull: trimesh.Trimesh) -> Float[np.ndarray, "n 3"]:
