@@ -112,8 +112,9 @@ def target(args: Args) -> Target:
                 "--labels, --scale, --units, --mass and --density belong to --mesh: leave them out with --object."
             )
         obj = load_object(args.object)
-        line = f"{obj.name}: {size_in_words(obj)}, {obj.mass:.3g} kg"
-        return Target(obj, region_of(obj, args.region or obj.target), (line,), False)
+        assumed = obj.folder is None
+        line = f"{obj.name}: {size_in_words(obj)}, {obj.mass:.3g} kg{' assumed' if assumed else ''}"
+        return Target(obj, region_of(obj, args.region or obj.target), (line,), assumed)
     assert args.mesh is not None
     if args.mass is not None and args.density is not None:
         raise InputError("--mass and --density exclude each other: give one of them.")
