@@ -97,8 +97,14 @@ class Target:
     assumed: bool
 
 
-def target(args: Args) -> Target:
-    """What to search grasps for."""
+def target(args: Args) -> tuple[AffordanceObject, str | None]:
+    """The object, and the region to hold (None: any)."""
+    found = described_target(args)
+    return found.obj, found.region
+
+
+def described_target(args: Args) -> Target:
+    """What to search grasps for, and what is known of it."""
     if (args.object is None) == (args.mesh is None):
         raise InputError("Give either --object or --mesh, for example --object jug.")
     if args.num < 1 or args.baselines < 0:
@@ -136,7 +142,7 @@ def region_of(obj: AffordanceObject, region: str) -> str | None:
 
 def run(args: Args) -> None:
     """Generate, print and write."""
-    wanted = target(args)
+    wanted = described_target(args)
     obj, region = wanted.obj, wanted.region
     robot = load_robot(args.robot)
     out = args.out or Path("runs") / "grasps" / f"{obj.name}.safetensors"

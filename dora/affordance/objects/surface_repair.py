@@ -199,8 +199,11 @@ def _without_buried_openings(body: Body, bodies: list[Body]) -> Body:
     count = body.holes + body.mouths
     if body.sheet is None or len(bodies) == 1:
         return body
-    middles, others = np.array(body.mesh.vertices)[-count:], [each.mesh for each in bodies if each is not body]
-    buried = np.any([ExactDistance(other)(middles) < 0 for other in others], axis=0)
+    middles = np.array(body.mesh.vertices)[-count:]
+    buried = np.zeros(count, bool)
+    for other in (each.mesh for each in bodies if each is not body):
+        near = ((middles > other.bounds[0]) & (middles < other.bounds[1])).all(1)
+        buried[near] |= ExactDistance(other)(middles[near]) < 0
     return replace(body, sheet=None, holes=count, mouths=0) if buried.all() else body
 
 
