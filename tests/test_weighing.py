@@ -206,6 +206,15 @@ def test_the_commands_refuse_them(
     assert said.count("\n") == 1
 
 
+def test_walls_count_as_one_to_three_millimetres_thick():
+    for wall, counted in ((0.00001, 0.003), (0.0002, 0.001), (0.002, 0.002), (0.006, 0.003)):
+        outer, inner = (trimesh.creation.icosphere(subdivisions=3, radius=r) for r in (0.05, 0.05 - wall))
+        area = (outer.area + inner.area) / 2
+        assert weighed(joined(outer, inverted(inner))).mass == pytest.approx(1000 * counted * area, rel=0.05)
+    thick = joined(outer, inverted(trimesh.creation.icosphere(subdivisions=3, radius=0.03)))
+    assert weighed(thick).mass == pytest.approx(600 * thick.volume)
+
+
 def test_a_folder_of_a_given_density(cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     monkeypatch.setenv("DORA_CACHE", str(cache))
     trimesh.creation.box((0.05, 0.04, 0.03)).export(cache / "brick.stl")
