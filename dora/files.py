@@ -1,5 +1,6 @@
 """Atomic writing of files, and safetensors files with a digest that detects damage."""
 
+import codecs
 import csv
 import hashlib
 import io
@@ -19,6 +20,16 @@ from dora.errors import InputError
 
 METADATA = "metadata"
 """Entry of a file's header with the metadata of `write_tensors`, which its digest covers."""
+
+
+def decoded(content: bytes) -> str:
+    """Text in UTF-8, with or without a byte order mark, or in UTF-16 with one.
+
+    Raises:
+        UnicodeDecodeError: it is neither.
+    """
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return content.decode("utf-16" if wide else "utf-8-sig")
 
 
 def write_bytes(path: Path, content: bytes) -> None:

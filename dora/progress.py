@@ -24,10 +24,10 @@ class ProgressDisplay:
         self.console = console or Console(stderr=True)
         self._next_line = 0.0
         self._bars = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             TaskProgressColumn(),
-            TextColumn("{task.fields[status]}"),
+            TextColumn("{task.fields[status]}", markup=False),
             TextColumn("ETA"),
             TimeRemainingColumn(),
             console=self.console,
@@ -73,4 +73,4 @@ class ProgressDisplay:
 
     def say(self, text: str) -> None:
         """Print one line above the bars."""
-        self.console.print(text, highlight=False, soft_wrap=True)
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -1,6 +1,7 @@
 """Tables as Markdown, HTML pages and text on a terminal: by jinja2, which escapes what comes from files, and rich."""
 
 import io
+import sys
 from collections.abc import Sequence
 
 import jinja2
@@ -17,6 +18,13 @@ _MARKDOWN = _PLAIN.from_string("""\
 | {% for cell in row %}{{ cell | replace("|", "\\\\|") }}{{ " | " if not loop.last }}{% endfor %} |
 {%- endfor %}""")
 """A Markdown table."""
+
+
+def show_any_script() -> None:
+    """Let standard output and error print names in any script: letters that they lack are shown as escapes."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -9,24 +9,27 @@ iteration), and writes OUT (safetensors) and a .json beside it. `experiments/vie
 """
 
 import sys
+import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from dora.affordance.contact_maps import map_bundled_set
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import available_objects, load_object
-from dora.affordance.objects.importing import import_object
+from dora.affordance.objects.importing import import_mesh, size_in_words
 from dora.affordance.search.backends import Kinematics
 from dora.affordance.search.optimise import Settings
 from dora.errors import InputError
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.sim.grasp_tests.bundle_maker import make_bundle
+from dora.sim.grasp_tests.failures import hint
 from dora.sim.grasp_tests.generation import baselines, by_region, generate, summary, voting_summary
 from dora.sim.grasp_tests.report import check_out, print_agreement, print_report, write_report
+from dora.tables import show_any_script
 from dora.tools.task_ranking import rank_bundled_set, tasks_of, usable_in_task
 
 INTERRUPTED = 130
@@ -57,6 +60,10 @@ class Args:
     """Factor of all lengths of --mesh."""
     units: Literal["m", "cm", "mm", "in"] = "m"
     """Unit of length of --mesh; GLB files are in metres."""
+    mass: float | None = None
+    """Mass of --mesh [kg] (default: an estimate from its geometry, which is printed; docs/objects.md has the rule)."""
+    density: float | None = None
+    """Density of the material of --mesh [kg/m^3], in the place of --mass."""
     robot: str = "diana7_hit"
     """Robot whose hand grasps: a folder name in robots/ or a path."""
     out: Path | None = None
@@ -84,8 +91,24 @@ class Args:
     """Make the contact semantic maps of the bundled set of --object anew, and print what they vote for."""
 
 
+@dataclass(frozen=True, eq=False)
+class Target:
+    """The object, the region to hold (None: any), lines about the object, and whether its mass is an estimate."""
+
+    obj: AffordanceObject
+    region: str | None
+    lines: tuple[str, ...]
+    assumed: bool
+
+
 def target(args: Args) -> tuple[AffordanceObject, str | None]:
     """The object, and the region to hold (None: any)."""
+    found = described_target(args)
+    return found.obj, found.region
+
+
+def described_target(args: Args) -> Target:
+    """What to search grasps for, and what is known of it."""
     if (args.object is None) == (args.mesh is None):
         raise InputError("Give either --object or --mesh, for example --object jug.")
     if args.num < 1 or args.baselines < 0:
@@ -93,43 +116,49 @@ def target(args: Args) -> tuple[AffordanceObject, str | None]:
     if args.by_region < 0 or (args.by_region and args.validate == "none"):
         raise InputError(f"--by-region is {args.by_region}: give a positive number, and --validate sapien with it.")
     if args.object is not None:
-        if args.labels is not None or args.scale != 1 or args.units != "m":
-            raise InputError("--labels, --scale and --units belong to --mesh: leave them out with --object.")
+        given = (args.labels, args.mass, args.density)
+        if any(value is not None for value in given) or args.scale != 1 or args.units != "m":
+            raise InputError(
+                "--labels, --scale, --units, --mass and --density belong to --mesh: leave them out with --object."
+            )
         obj = load_object(args.object)
-        return obj, region_of(obj, args.region or obj.target)
+        assumed = obj.folder is None
+        line = f"{obj.name}: {size_in_words(obj)}, {obj.mass:.3g} kg{' assumed' if assumed else ''}"
+        return Target(obj, region_of(obj, args.region or obj.target), (line,), assumed)
     assert args.mesh is not None
-    obj = import_object(args.mesh, labels=args.labels, scale=args.scale, units=args.units)
-    return obj, region_of(obj, args.region or ANY)
+    if args.mass is not None and args.density is not None:
+        raise InputError("--mass and --density exclude each other: give one of them.")
+    found = import_mesh(
+        args.mesh, labels=args.labels, scale=args.scale, units=args.units, mass=args.mass, density=args.density
+    )
+    region = region_of(found.object, args.region or ANY)
+    return Target(found.object, region, found.lines(), found.weighing.assumed)
 
 
 def region_of(obj: AffordanceObject, region: str) -> str | None:
     """A region that the object has; None for any."""
     if region == ANY:
         return None
+    region = unicodedata.normalize("NFC", region) if region not in obj.labels else region
     obj.label_index(region)
     return region
 
 
 def run(args: Args) -> None:
     """Generate, print and write."""
-    obj, region = target(args)
+    wanted = described_target(args)
+    obj, region = wanted.obj, wanted.region
     robot = load_robot(args.robot)
     out = args.out or Path("runs") / "grasps" / f"{obj.name}.safetensors"
     check_out(out)
     simulate, settings = args.validate == "sapien", Settings(seat=args.seat)
+    print(*wanted.lines, sep="\n", flush=True)
     with ProgressDisplay() as phases:
         generated = generate(
-            obj,
-            robot,
-            args.num,
-            args.seed,
-            region,
-            phases,
-            simulate,
-            Settings(seat=args.seat),
-            kinematics=args.kinematics,
+            obj, robot, args.num, args.seed, region, phases, simulate, settings, kinematics=args.kinematics
         )
-        report = summary(generated) | {"kinematics": args.kinematics}
+        report: dict[str, Any] = summary(generated) | {"kinematics": args.kinematics} | about(wanted)
+        report["failures"]["hint"] = hint(report["failures"], obj, wanted.assumed)
         searches = {}
         if args.by_region:
             searches = by_region(obj, robot, args.by_region, args.seed, region, phases, args.kinematics, settings)
@@ -143,6 +172,17 @@ def run(args: Args) -> None:
     print_report(report)
     write_report(report, generated.candidates, out)
     print(out)
+
+
+def about(wanted: Target) -> dict[str, Any]:
+    """Mass, size and notes as values for JSON."""
+    size = [100 * side for side in wanted.obj.mesh.extents.tolist()]
+    return {
+        "mass_kg": wanted.obj.mass,
+        "mass_assumed": wanted.assumed,
+        "size_cm": size,
+        "notes": list(wanted.lines),
+    }
 
 
 def remake(args: Args) -> None:
@@ -171,6 +211,7 @@ def remake(args: Args) -> None:
 def main() -> int:
     """Run the command; returns the exit status."""
     description = f"{__doc__}\nObjects: {', '.join(available_objects())}."
+    show_any_script()
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=description)
     try:
         if args.make_bundle or args.rank_in_task or args.contact_maps:

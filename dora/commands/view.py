@@ -28,6 +28,7 @@ from dora.affordance.views.album import write_album, write_objects
 from dora.affordance.views.page import GraspPage
 from dora.errors import InputError
 from dora.robot import RobotDescription, load_robot
+from dora.tables import show_any_script
 
 BAD_INPUT = 2
 """Exit status after an `InputError`."""
@@ -95,6 +96,7 @@ def with_bundle(obj: AffordanceObject, robot: RobotDescription) -> tuple[Afforda
 def main() -> int:
     """Serve the page until Ctrl-C; returns the exit status."""
     description = f"{__doc__}\nObjects: {', '.join(available_objects())}."
+    show_any_script()
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=description)
     try:
         if args.source is None and args.pictures is not None:

@@ -18,9 +18,10 @@ import tyro
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import own_objects
 from dora.affordance.objects.folder_writing import write_object_folder
-from dora.affordance.objects.importing import import_object
+from dora.affordance.objects.importing import import_mesh
 from dora.affordance.objects.models import cube, hammer, jug, microwave
 from dora.errors import InputError
+from dora.tables import show_any_script
 
 MODELS: dict[str, Callable[[], AffordanceObject]] = {
     "cube": cube.build, "hammer": hammer.build, "jug": jug.build, "microwave": microwave.build,
@@ -45,7 +46,9 @@ class Args:
     scale: float = 1.0
     """Factor of all lengths of --mesh."""
     mass: float | None = None
-    """Mass of --mesh [kg]; that of wood if not given."""
+    """Mass of --mesh [kg] (default: an estimate from its geometry; docs/objects.md has the rule)."""
+    density: float | None = None
+    """Density of the material of --mesh [kg/m^3], in the place of --mass."""
 
 
 def model(name: str) -> AffordanceObject:
@@ -63,21 +66,26 @@ def run(args: Args) -> list[Path]:
     """Write what is asked for; returns the paths of the object.toml files.
 
     Raises:
-        InputError: unknown model, a mesh without a single folder, or as `import_object`.
+        InputError: unknown model, a mesh without a single folder, or as `import_mesh`.
     """
     if args.mesh is None:
-        if args.labels is not None or args.mass is not None or args.units != "m" or args.scale != 1:
-            raise InputError("--labels, --units, --scale and --mass belong to --mesh: give that as well.")
+        given = (args.labels, args.mass, args.density)
+        if any(value is not None for value in given) or args.units != "m" or args.scale != 1:
+            raise InputError("--labels, --units, --scale, --mass and --density belong to --mesh: give that as well.")
         folders = args.folders or [own_objects() / name for name in MODELS]
         return [write_object_folder(model(folder.resolve().name), folder) for folder in folders]
     if len(args.folders) != 1:
         raise InputError("--mesh needs the one folder to write, for example: build my/mug --mesh mug.stl.")
-    obj = import_object(args.mesh, labels=args.labels, scale=args.scale, units=args.units, mass=args.mass)
-    return [write_object_folder(obj, args.folders[0])]
+    found = import_mesh(
+        args.mesh, labels=args.labels, scale=args.scale, units=args.units, mass=args.mass, density=args.density
+    )
+    print(*found.lines(), sep="\n", file=sys.stderr)
+    return [write_object_folder(found.object, args.folders[0])]
 
 
 def main() -> int:
     """Run the command; returns the exit status."""
+    show_any_script()
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     try:
         print(*run(args), sep="\n")

@@ -25,6 +25,7 @@ from dora.affordance.objects.affordance_object import (
 from dora.affordance.objects.importing import LARGEST, SMALLEST
 from dora.affordance.objects.mesh_files import LABEL, read_ply
 from dora.errors import InputError
+from dora.files import decoded
 from dora.robot.shapes import Shape
 
 OBJECT_FILE = "object.toml"
@@ -82,7 +83,7 @@ class _Reader:
         if self.path.stat().st_size > MOST_BYTES:
             raise self.fail(f"the file has more than {MOST_BYTES} bytes; keep meshes in files of their own.")
         try:
-            content = tomllib.loads(self.path.read_text("utf-8"))
+            content = tomllib.loads(decoded(self.path.read_bytes()))
         except (ValueError, RecursionError) as error:
             raise self.fail(f"the file is not valid TOML ({error}); correct it.") from error
         for key in RESERVED:

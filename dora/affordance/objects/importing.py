@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-import re
+import codecs
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from trimesh.resolvers import FilePathResolver
 
 from dora.affordance.objects.affordance_object import UPRIGHT, AffordanceObject, Piece, assemble
 from dora.affordance.objects.decomposition import THRESHOLD, decompose
-from dora.affordance.objects.labels import WHOLE, FaceLabels, grasp_class, read_labels
+from dora.affordance.objects.labels import WHOLE, FaceLabels, grasp_classes, read_labels, without_number
 from dora.affordance.objects.surface_repair import repair
+from dora.affordance.objects.surfaces.weighing import Weighing, check_weight, weigh
 from dora.errors import InputError
+from dora.files import decoded
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Factor from each unit of length to metres [m]."""
@@ -22,8 +28,8 @@ SMALLEST, LARGEST = 0.005, 2.0
 """Range of the longest side of an object, outside of which its unit is most likely wrong [m]."""
 MOST_FACES = 200_000
 """Largest number of faces of a mesh."""
-DENSITY = 600.0
-"""Density where no mass is given, that of wood [kg/m^3]."""
+USUAL = (0.01, 0.6)
+"""Range of the longest side outside of which a size is remarked on [m]."""
 STABLE = 0.002
 """Smallest distance of the centre of mass from the outline of the foot at which an object stands as modelled [m]."""
 
@@ -36,6 +42,7 @@ def import_object(
     mass: float | None = None,
     threshold: float = THRESHOLD,
     cache_dir: Path | str | None = None,
+    density: float | None = None,
 ) -> AffordanceObject:
     """An object from a file. Axes are kept, the origin moves to the centre of mass.
 
@@ -45,42 +52,97 @@ def import_object(
             bodies of the file, else its materials, else the whole mesh.
         scale: factor of all lengths [1].
         units: unit of length of the file, one of `UNITS`; glTF files are in metres.
-        mass: mass [kg]; that of wood if None.
+        mass: mass [kg]; an estimate if None, see `dora.affordance.objects.surfaces.weighing`.
         threshold: concavity of the convex decomposition, see `dora.affordance.objects.decomposition.decompose` [1].
         cache_dir: folder of cached decompositions; the default one if None.
+        density: density of the material [kg/m^3], in the place of a mass.
 
     Raises:
         InputError: the file cannot be read, is empty, not finite, cannot be closed, has too many faces or an absurd
-            size, or the labels do not fit.
+            size, the labels do not fit, or mass and density are out of range or both given.
     """
+    return import_mesh(path, labels, scale, units, mass, threshold, cache_dir, density).object
+
+
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """An object from a mesh file, and what was done and assumed on the way.
+
+    Attributes:
+        object: the object.
+        weighing: its mass, and whether that is an estimate.
+        notes: what was done to the mesh, and what looks doubtful.
+    """
+
+    object: AffordanceObject
+    weighing: Weighing
+    notes: tuple[str, ...]
+
+    def lines(self) -> tuple[str, ...]:
+        """Size and mass, regions, and notes, a line each."""
+        name = self.object.name
+        first = f"{size_in_words(self.object)}, {self.weighing.sentence()}"
+        pairs = zip(self.object.labels, self.object.classes, strict=True)
+        regions = f"regions {', '.join(f'{label} ({own})' for label, own in pairs)}"
+        return tuple(f"{name}: {text}" for text in (first, regions, *self.notes))
+
+
+def size_in_words(obj: AffordanceObject) -> str:
+    """Sides of the bounding box along x, y and z in centimetres."""
+    return " x ".join(f"{100 * side:.1f}" for side in obj.mesh.extents) + " cm"
+
+
+def import_mesh(
+    path: Path | str,
+    labels: Path | str | None = None,
+    scale: float = 1.0,
+    units: str = "m",
+    mass: float | None = None,
+    threshold: float = THRESHOLD,
+    cache_dir: Path | str | None = None,
+    density: float | None = None,
+) -> Imported:
+    """As `import_object`, with an account of what was done and assumed."""
     path = Path(path)
     if units not in UNITS:
         raise InputError(f"the unit {units!r} is unknown; use --units with one of: {', '.join(UNITS)}.")
-    for name, value in (("scale", scale), ("mass", 1.0 if mass is None else mass)):
-        if not (np.isfinite(value) and value > 0):
-            raise InputError(f"the {name} of {path} is {value}; give a positive number.")
+    if not (np.isfinite(scale) and scale > 0):
+        raise InputError(f"the scale of {path} is {scale}; give a positive number.")
+    check_weight(path, mass, density)
     raw, names = read_mesh(path, keep_order=labels is not None)
-    _check_size(raw, path, scale * UNITS[units])
+    _check_size(raw, path, scale, units)
     given = FaceLabels.from_names(names) if labels is None else read_labels(Path(labels), raw.triangles_center)
     raw = trimesh.Trimesh(raw.vertices * (scale * UNITS[units]), raw.faces, process=False)
     repaired = repair(raw, given.index, str(path))
     mesh = repaired.mesh
     kept = [i for i in range(len(given.names)) if (repaired.labels == i).any()]
     index = np.searchsorted(kept, repaired.labels)
-    regions = {given.names[i]: grasp_class(given.names[i]) for i in kept}
+    regions = grasp_classes([given.names[i] for i in kept])
     if given.target not in regions:
         raise InputError(f"the region {given.target!r} of {path} lies inside other parts; choose another target.")
-    hulls = decompose(mesh, threshold, cache_dir)
-    return assemble(
+    hulls, weighing = decompose(mesh, threshold, cache_dir), weigh(repaired, mass, density)
+    obj = assemble(
         path.stem,
         mesh,
         index,
         regions,
         given.target,
-        weights=[(mesh, float(mesh.volume) * DENSITY if mass is None else mass)],
+        weights=weighing.weights,
         pieces=[Piece(tuple(regions)[_label_of(hull, mesh, index)], hull) for hull in hulls],
-        rest=resting_pose(mesh),
+        rest=resting_pose(mesh, weighing.center),
     )
+    lost = [name for name in given.names if name not in regions]
+    obj = replace(obj, mass=weighing.mass)  # without the rounding of a sum
+    return Imported(obj, weighing, (*repaired.actions, *_doubts(obj, units, lost)))
+
+
+def _doubts(obj: AffordanceObject, units: str, lost: Sequence[str]) -> list[str]:
+    """Remarks on a size that no object for a hand has, and on regions without a face on the surface."""
+    doubts = [f"the region {name!r} lies inside other parts or on what was dropped, and is left out" for name in lost]
+    longest = float(obj.mesh.extents.max())
+    if not USUAL[0] <= longest <= USUAL[1]:
+        doubts.append(f"{100 * longest:.3g} cm is an unusual length for a hand: give --units if it is not in {units}")
+    return doubts
 
 
 def read_mesh(path: Path, keep_order: bool = False) -> tuple[trimesh.Trimesh, list[str]]:
@@ -95,15 +157,12 @@ def read_mesh(path: Path, keep_order: bool = False) -> tuple[trimesh.Trimesh, li
     """
     if not path.is_file():
         raise InputError(f"there is no mesh file {path}.")
-    scene = _load(
-        path,
-        {"maintain_order": True, "skip_materials": True}
-        if keep_order
-        else {"split_objects": True, "group_material": False},
-    )
-    parts = _parts(scene)
-    if path.suffix.lower() == ".obj" and not keep_order and len(parts) == 1:
+    if path.suffix.lower() != ".obj":
         parts = _parts(_load(path, {}))
+    elif keep_order:
+        parts = _parts(_load(path, {"maintain_order": True, "skip_materials": True}))
+    else:
+        parts = _obj_parts(path)
     if not parts:
         raise InputError(f"{path} holds no triangles: export the surface of the object as a triangle mesh.")
     mesh = cast(trimesh.Trimesh, trimesh.util.concatenate([part for _, part in parts]))
@@ -114,18 +173,44 @@ def read_mesh(path: Path, keep_order: bool = False) -> tuple[trimesh.Trimesh, li
     return mesh, [name for name, part in parts for _ in range(len(part.faces))]
 
 
+def _obj_parts(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
+    """Triangle meshes of an OBJ file, named by objects if there are several, else by groups, else by materials."""
+    for split in ({"split_objects": True, "group_material": False}, {"split_groups": True, "group_material": False}):
+        parts = _parts(_load(path, split))
+        if len({name for name, _ in parts}) > 1:
+            return parts
+    return _parts(_load(path, {}))
+
+
+class _Files(FilePathResolver):
+    """Files beside a mesh, such as its materials, without byte order marks."""
+
+    def get(self, name: str) -> bytes:
+        return _without_mark(super().get(name))
+
+
+def _without_mark(content: bytes) -> bytes:
+    """The content of a file; a text with a byte order mark in UTF-8 without one."""
+    marked = content.startswith((codecs.BOM_UTF8, codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return decoded(content).encode() if marked else content
+
+
 def _load(path: Path, options: dict[str, Any]) -> trimesh.Scene:
-    """The scene that trimesh reads from a file; `options` apply to OBJ files alone."""
-    own = options if path.suffix.lower() == ".obj" else {}
+    """The scene that trimesh reads from a file; `options` are those of its format."""
     try:
-        return trimesh.load_scene(path, process=False, **own)
+        content = io.BytesIO(_without_mark(path.read_bytes()))
+        kind = path.suffix.lower().removeprefix(".")
+        return trimesh.load_scene(content, file_type=kind, resolver=_Files(str(path)), process=False, **options)
     except Exception as error:  # the readers of some twenty formats raise whatever they meet
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path} cannot be read ({reason}): export it as OBJ, STL, PLY or GLB.") from error
 
 
 def _parts(scene: trimesh.Scene) -> list[tuple[str, trimesh.Trimesh]]:
-    """Triangle meshes of a scene in its frame, named by body if these names differ, else by material."""
+    """Triangle meshes of a scene in its frame, named by body if these names differ, else by material.
+
+    Names that differ in the number of a copy only are one name.
+    """
     placed, order = [], {name: i for i, name in enumerate(scene.geometry)}
     for node in sorted(scene.graph.nodes_geometry, key=lambda node: (order[scene.graph[node][1]], node)):
         pose, name = scene.graph[node]
@@ -133,26 +218,21 @@ def _parts(scene: trimesh.Scene) -> list[tuple[str, trimesh.Trimesh]]:
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
             material = getattr(getattr(part.visual, "material", None), "name", None)
             placed.append((name, material or name, part.copy().apply_transform(pose)))
-    bodies = {_without_number(name) for name, _, _ in placed}
-    materials = {material for _, material, _ in placed}
-    if len(bodies) > 1:
-        return [(name, part) for name, _, part in placed]
-    if len(materials) > 1:
-        return [(material, part) for _, material, part in placed]
+    for names in ([without_number(name) for name, _, _ in placed], [without_number(each) for _, each, _ in placed]):
+        if len(set(names)) > 1:
+            return [(name, part) for name, (_, _, part) in zip(names, placed, strict=True)]
     return [(WHOLE, part) for _, _, part in placed]
 
 
-def _without_number(name: str) -> str:
-    """A name without the number that editors add to copies: "part.001" -> "part"."""
-    return re.sub(r"[._ -]?\d+$", "", name)
-
-
-def _check_size(mesh: trimesh.Trimesh, path: Path, factor: float) -> None:
+def _check_size(mesh: trimesh.Trimesh, path: Path, scale: float, units: str) -> None:
     """Refuses meshes outside of `SMALLEST` to `LARGEST`, which most often have the wrong unit."""
-    longest = float(mesh.extents.max()) * factor
+    own = float(mesh.extents.max()) * scale
+    longest = own * UNITS[units]
     if not SMALLEST <= longest <= LARGEST:
+        fitting = [unit for unit, factor in UNITS.items() if USUAL[0] <= own * factor <= USUAL[1]]
+        sizes = " or ".join(f"{100 * own * UNITS[unit]:.3g} cm with --units {unit}" for unit in fitting)
         raise InputError(
-            f"{path} would be {longest:.3g} m long, not {SMALLEST} to {LARGEST} m: "
+            f"{path} would be {longest:.3g} m long, not {SMALLEST} to {LARGEST} m{sizes and f' (it is {sizes})'}: "
             f"say in what units it is with --units ({', '.join(UNITS)}), or give --scale."
         )
 
@@ -165,20 +245,28 @@ def _label_of(hull: trimesh.Trimesh, mesh: trimesh.Trimesh, index: np.ndarray) -
     return int(np.bincount(index[near], weights=mesh.area_faces[near]).argmax())
 
 
-def resting_pose(mesh: trimesh.Trimesh) -> tuple[float, float, float, float]:
-    """Orientation at rest on a table, wxyz: as modelled if that is stable, else the most probable stable pose."""
-    if _stands(mesh):
+def resting_pose(
+    mesh: trimesh.Trimesh, center: Float[np.ndarray, " 3"] | None = None
+) -> tuple[float, float, float, float]:
+    """Orientation at rest on a table, wxyz: as modelled if that is stable, else the most probable stable pose.
+
+    Args:
+        mesh: watertight surface [m].
+        center: centre of mass (3,) [m]; that of a uniform solid if None.
+    """
+    center = mesh.center_mass if center is None else center
+    if _stands(mesh, center):
         return UPRIGHT
     with np.errstate(invalid="ignore"):
-        poses, _ = trimesh.poses.compute_stable_poses(mesh)
+        poses, _ = trimesh.poses.compute_stable_poses(mesh, center_mass=center)
     w, x, y, z = (float(v) for v in trimesh.transformations.quaternion_from_matrix(poses[0]))
     return w, x, y, z
 
 
-def _stands(mesh: trimesh.Trimesh) -> bool:
+def _stands(mesh: trimesh.Trimesh, center: Float[np.ndarray, " 3"]) -> bool:
     """Whether the centre of mass is above the convex hull of the lowest points, by at least `STABLE`."""
     z = mesh.vertices[:, 2]
-    foot: Float[np.ndarray, "n 2"] = mesh.vertices[z < z.min() + STABLE / 4][:, :2] - mesh.center_mass[:2]
+    foot: Float[np.ndarray, "n 2"] = mesh.vertices[z < z.min() + STABLE / 4][:, :2] - center[:2]
     around = np.arange(0, 2 * np.pi, 0.1)
     directions = np.stack([np.cos(around), np.sin(around)])
     return bool(((foot @ directions).max(0) > STABLE).all())

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Callable, Sequence
+import unicodedata
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,18 @@ import yaml
 from jaxtyping import Bool, Float, Int
 
 from dora.errors import InputError
+from dora.files import decoded
 
 WHOLE = "body"
 """Label of a mesh without parts, and of faces in no region."""
 WANTED = "handle"
 """Label that is the default target if a mesh has it."""
+COPY = "0123456789._ -()"
+"""Characters at the end of the name of a copy."""
+UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn")
+"""Unicode categories of characters that do not show, such as byte order marks and marks of direction."""
+NAMELESS, NUMBER = "Region", "No"
+"""Grasp class of a name without letters or digits, and what stands before the number of a class."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,19 +54,50 @@ class FaceLabels:
         Raises:
             InputError: the target is none of the names.
         """
-        distinct = tuple(dict.fromkeys(names))
+        tidy = {name: _tidy(name, source) for name in dict.fromkeys(names)}
+        distinct = tuple(dict.fromkeys(tidy.values()))
+        target = None if target is None else _tidy(str(target), source)
         if target is None:
             target = WANTED if WANTED in distinct else distinct[0]
         if target not in distinct:
             raise InputError(f"{source} asks for the target {target!r}; choose one of: {', '.join(distinct)}.")
         place = {name: i for i, name in enumerate(distinct)}
-        return cls(distinct, np.array([place[name] for name in names], np.int64), target)
+        return cls(distinct, np.array([place[tidy[name]] for name in names], np.int64), target)
+
+
+def _tidy(name: str, source: str) -> str:
+    """A name in composed letters, without characters that do not show and with single spaces between its words."""
+    shown = "".join(" " if c.isspace() else c for c in name if c.isspace() or unicodedata.category(c) not in UNSEEN)
+    tidy = " ".join(unicodedata.normalize("NFC", shown).split())
+    if not tidy:
+        raise InputError(f"{source} has a region whose name {name!r} shows no character; give it a name.")
+    return tidy
+
+
+def without_number(name: str) -> str:
+    """A name without the numbers that editors add to copies: "handle.001", "handle_2" and "handle (2)" -> "handle"."""
+    start = name.rstrip(COPY)
+    end = name[len(start) :]
+    return start if start and end.strip("._ -()") and end[-1] not in "._ -(" else name
 
 
 def grasp_class(label: str) -> str:
-    """Grasp class of a label: "handle" -> "HandleGrasp", "left ear" -> "LeftEarGrasp"."""
-    words = re.split(r"[^0-9A-Za-z]+", label)
-    return "".join(word[:1].upper() + word[1:] for word in words) + "Grasp"
+    """Grasp class of a label in any script: "handle" -> "HandleGrasp", "left ear" -> "LeftEarGrasp"."""
+    letters = unicodedata.normalize("NFC", label)
+    words = "".join(c if unicodedata.category(c)[0] in "LMN" else " " for c in letters).split()
+    return "".join(word[:1].upper() + word[1:] for word in words or [NAMELESS]) + "Grasp"
+
+
+def grasp_classes(labels: Iterable[str]) -> dict[str, str]:
+    """Grasp class of each label; those that would be equal are told apart by a number: "rim 1", "rim-1"."""
+    found: dict[str, str] = {}
+    for label in labels:
+        name, count = grasp_class(label), 1
+        while name in found.values():
+            count += 1
+            name = f"{grasp_class(label).removesuffix('Grasp')}{NUMBER}{count}Grasp"
+        found[label] = name
+    return found
 
 
 def read_labels(path: Path, centers: Float[np.ndarray, "f 3"]) -> FaceLabels:
@@ -91,7 +129,7 @@ def read_labels(path: Path, centers: Float[np.ndarray, "f 3"]) -> FaceLabels:
 
 
 def _from_text(path: Path, centers: np.ndarray) -> FaceLabels:
-    return _per_face(path, path.read_text().split("\n"), centers)
+    return _per_face(path, decoded(path.read_bytes()).split("\n"), centers)
 
 
 def _from_array(path: Path, centers: np.ndarray) -> FaceLabels:
@@ -99,7 +137,7 @@ def _from_array(path: Path, centers: np.ndarray) -> FaceLabels:
 
 
 def _from_json(path: Path, centers: np.ndarray) -> FaceLabels:
-    content = json.loads(path.read_text())
+    content = json.loads(decoded(path.read_bytes()))
     if isinstance(content, list):
         return _per_face(path, content, centers)
     known = {"labels", "faces", "target"}
@@ -131,7 +169,7 @@ def _per_face(
 
 def _from_yaml(path: Path, centers: np.ndarray) -> FaceLabels:
     """Labels from regions in space; a face belongs to the first region that contains its centre."""
-    content = yaml.safe_load(path.read_text())
+    content = yaml.safe_load(decoded(path.read_bytes()))
     known = {"regions", "rest", "target"}
     if not isinstance(content, dict) or not isinstance(content.get("regions"), dict) or not content.keys() <= known:
         raise InputError(f"{path} must hold a mapping 'regions' and, if wanted, 'rest' and 'target', nothing else.")

@@ -171,7 +171,7 @@ def unite(
         ValueError: a part is not closed.
     """
     first = manifold3d.Manifold.reserve_ids(len(parts))
-    solids = [_manifold(part, first + index) for index, part in enumerate(parts)]
+    solids = [manifold_of(part, first + index) for index, part in enumerate(parts)]
     raw = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).to_mesh64()
     runs = np.diff(raw.run_index).astype(np.int64) // 3
     part = np.repeat(np.array(raw.run_original_id, np.int64) - first, runs)
@@ -180,7 +180,7 @@ def unite(
 
 def subtract(body: trimesh.Trimesh, tool: trimesh.Trimesh) -> trimesh.Trimesh:
     """The difference of two watertight meshes: the body without the inside of the tool."""
-    return _trimesh((_manifold(body) - _manifold(tool)).to_mesh64())
+    return _trimesh((manifold_of(body) - manifold_of(tool)).to_mesh64())
 
 
 def outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -190,8 +190,12 @@ def outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return mesh
 
 
-def _manifold(mesh: trimesh.Trimesh, identity: int = 0) -> manifold3d.Manifold:
-    """A mesh for manifold3d, whose results refer to its faces by `identity` and face index."""
+def manifold_of(mesh: trimesh.Trimesh, identity: int = 0) -> manifold3d.Manifold:
+    """A watertight mesh for manifold3d, whose results refer to its faces by `identity` and face index.
+
+    Raises:
+        ValueError: it is not closed.
+    """
     raw = manifold3d.Mesh64(
         np.array(mesh.vertices, np.float64, order="C"),
         np.array(mesh.faces, np.uint64, order="C"),

@@ -2,139 +2,228 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import networkx as nx
 import numpy as np
 import trimesh
 from jaxtyping import Int
 
+from dora.affordance.objects.signed_distance import ExactDistance
 from dora.affordance.objects.solids import unite
+from dora.affordance.objects.surfaces.body_relations import Nesting, loose_parts, nesting
+from dora.affordance.objects.surfaces.face_cleaning import adjacency, clean
 from dora.errors import InputError
 
-MERGE_SHARE = 1e-6
-"""Distance in diagonals of the mesh below which vertices are merged [1]."""
-MOST_FILLED = 0.3
-"""Largest ratio of the area of filled holes to that of the mesh [1]."""
-DEBRIS = 0.01
-"""Share of the area up to which a component that cannot be closed is dropped [1]."""
+MOST_FILLED, MOST_FILLED_DEEP = 0.53, 0.65
+"""Largest ratios of the area that closes openings to that of the mesh, of shallow and of deep ones [1]."""
+DEEP = 0.06
+"""Ratio of volume to area^1.5 from which what is closed is deep; half a ball has 0.072, a shallow tray 0.04 [1]."""
+SCRAP = 0.05
+"""Share of the area up to which a component that cannot be closed, or is flat, is dropped [1]."""
+MOST_SCRAPS = 0.2
+"""Share of the area above which scraps together are no scraps any more [1]."""
 LEAST_VOLUME = 1e-4
 """Smallest ratio of volume to area^1.5 [1]; a ball has 0.094, a sheet 0."""
+FLAT = 0.015
+"""The same ratio below which an open scrap counts as flat [1]; a square bent by a tenth of its side has 0.012."""
+INSIDE = 0.01
+"""Share of the area from which a body inside another is worth a remark [1]."""
+FEWEST_FACES = 4
+"""Fewest faces of a closed surface [1]."""
+WIDE = 0.05
+"""Share of a body's area from which closed openings are more than damage: the body was modelled as a sheet [1]."""
+MOUTH_SHARE, MOUTH_EDGES, MOUTH_ROUNDNESS, MOUTH_BEND = 0.005, 12, 0.05, 0.02
+"""A smaller opening is the mouth of a sheet, too, if its rim is modelled: its least share of the area, edges, area per
+squared circumference (a circle has 0.08) [1], and its largest deviation from a plane per circumference [1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A watertight body with outward faces.
+
+    Attributes:
+        mesh: the closed surface.
+        labels: (f,) label of each face.
+        holes: number of small holes that were filled.
+        mouths: number of wide openings that were closed.
+        added: area that closed the openings.
+        sheet: the surface without what closed its openings, if it was open by more than damage; else None.
+        turned: whether its faces were turned outwards.
+        sense: 1 if the faces pointed outwards, -1 if inwards, 0 if that differed from face to face.
+    """
+
+    mesh: trimesh.Trimesh
+    labels: Int[np.ndarray, " f"]
+    holes: int
+    mouths: int
+    added: float
+    sheet: trimesh.Trimesh | None
+    turned: bool
+    sense: int
 
 
 @dataclass(frozen=True, eq=False)
 class Repaired:
-    """A watertight mesh, the label (f,) of each face, and descriptions of what was done to it."""
+    """A watertight mesh and how it came about.
+
+    Attributes:
+        mesh: the closed surface with outward faces.
+        labels: (f,) label of each face.
+        actions: descriptions of what was done to the mesh.
+        bodies: the bodies that were united.
+        cavities: closed cavities of each body, as bodies with outward faces; the mesh does not have them.
+    """
 
     mesh: trimesh.Trimesh
     labels: Int[np.ndarray, " f"]
     actions: tuple[str, ...]
+    bodies: tuple[Body, ...]
+    cavities: tuple[tuple[trimesh.Trimesh, ...], ...]
 
 
 def repair(mesh: trimesh.Trimesh, labels: Int[np.ndarray, " f"], name: str) -> Repaired:
-    """Merge vertices, drop degenerate and double faces and debris, fill holes, turn faces outwards, unite bodies.
+    """Merge vertices, drop degenerate and double faces and scraps, close openings, turn faces outwards, unite bodies.
 
-    A body inside another counts as solid, not as a cavity.
+    A body inside another is filled; if its faces point the other way it is a cavity and counts in `cavities`.
 
     Args:
         mesh: any triangles.
-        labels: (f,) labels of its faces; faces that fill a hole take the label of a neighbour.
+        labels: (f,) labels of its faces; faces that close an opening take the label of a neighbour.
         name: name of the mesh in error messages.
 
     Raises:
         InputError: the surface cannot be closed, would be closed by too much new surface, or holds no volume.
     """
-    mesh, labels, dropped = _clean(mesh, labels)
-    bodies, debris, holes = [], 0, 0
-    groups = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1)
+    mesh, labels, dropped = clean(mesh, labels)
+    bodies, scraps = _bodies(mesh, labels, name)
+    bodies = [_without_buried_openings(body, bodies) for body in bodies]
+    found = nesting([(body.mesh, body.sense) for body in bodies])
+    outer = [bodies[i] for i in found.outer]
+    kept, loose, clusters = loose_parts([body.mesh for body in outer])
+    scraps += [outer[i].mesh.area for i in loose]
+    outer, cavities = [outer[i] for i in kept], [found.cavities[i] for i in kept]
+    filled = [bodies[i].mesh.area for i in found.filled if bodies[i].mesh.area > INSIDE * mesh.area]
+    actions = _actions(outer, found, dropped, scraps, mesh.area, clusters, len(filled))
+    whole = (outer[0].mesh, outer[0].labels) if len(outer) == 1 else _united(outer, name)
+    hollow = tuple(tuple(bodies[i].mesh for i in inside) for inside in cavities)
+    return Repaired(*whole, actions, tuple(outer), hollow)
+
+
+def _bodies(mesh: trimesh.Trimesh, labels: np.ndarray, name: str) -> tuple[list[Body], list[float]]:
+    """The connected parts of a surface, closed, and the areas of those that are scraps."""
+    bodies, scraps = [], []
+    groups = trimesh.graph.connected_components(adjacency(mesh), nodes=np.arange(len(mesh.faces)), min_len=1)
     for group in groups:
-        body = trimesh.Trimesh(mesh.vertices, mesh.faces[group], process=False)
-        body.remove_unreferenced_vertices()
+        area = float(mesh.area_faces[group].sum())
+        small = area <= SCRAP * mesh.area
+        if small and len(group) < FEWEST_FACES:
+            scraps.append(area)
+            continue
+        part = trimesh.Trimesh(mesh.vertices, mesh.faces[group], process=False)
+        part.remove_unreferenced_vertices()
         try:
-            closed = _closed(body, labels[group], mesh.area, name)
+            body = _closed(part, labels[group], mesh.area, name)
         except InputError:
-            if body.area > DEBRIS * mesh.area:
+            if not small:
                 raise
-            debris += 1
+            scraps.append(area)
         else:
-            bodies.append(closed)
-            holes += closed.holes
+            if small and body.added and body.mesh.volume < FLAT * body.mesh.area**1.5:
+                scraps.append(area)
+            else:
+                bodies.append(body)
     if not bodies:
         raise InputError(f"{name} is a cloud of loose faces: export one closed surface per body.")
+    if sum(scraps) > MOST_SCRAPS * mesh.area:
+        raise InputError(
+            f"{name} falls into {len(bodies)} bodies and {len(scraps)} loose scraps, which are "
+            f"{sum(scraps) / mesh.area:.0%} of its surface: join them in a mesh editor, for instance by remeshing."
+        )
+    return bodies, scraps
+
+
+def _actions(
+    outer: list[Body], found: Nesting, dropped: int, scraps: list[float], area: float, clusters: int, inside: int
+) -> tuple[str, ...]:
+    """Descriptions of what was done, without those that do not apply."""
+    mouths = sum(body.mouths for body in outer)
+    cavities = sum(len(each) for each in found.cavities)
+    added = sum(body.added for body in outer if body.sheet is not None) / area
     counts = {
         "dropped {} degenerate or double faces": dropped,
-        "dropped {} loose scraps of surface": debris,
-        "filled {} holes": holes,
-        "turned {} bodies outwards": sum(body.turned for body in bodies),
-        "united {} bodies": len(bodies) if len(bodies) > 1 else 0,
+        f"dropped {{}} loose scraps of surface ({sum(scraps) / area:.1%} of it)": len(scraps),
+        "filled {} holes": sum(body.holes for body in outer),
+        f"closed {{}} wide openings of a surface without thickness (+{added:.0%} of surface): it is treated as "
+        "solid, hands stay out of it, and it weighs as a shell": mouths,
+        "turned {} bodies outwards": sum(body.turned for body in outer),
+        "found {} closed cavities, which weigh nothing and which hands do not enter": cavities,
+        "filled {} bodies inside others, whose faces point the same way: turn these if they are cavities": inside,
+        "united {} bodies": len(outer) if len(outer) > 1 else 0,
+        "hold {} groups of bodies that do not touch together as one rigid body": clusters if clusters > 1 else 0,
     }
-    actions = tuple(text.format(count) for text, count in counts.items() if count)
-    if len(bodies) == 1:
-        return Repaired(bodies[0].mesh, bodies[0].labels, actions)
-    return Repaired(*_united(bodies, name), actions)
+    return tuple(text.format(count) for text, count in counts.items() if count)
 
 
-@dataclass(frozen=True, eq=False)
-class _Body:
-    """A watertight body with outward faces, their labels, the holes filled, and whether its faces were turned."""
-
-    mesh: trimesh.Trimesh
-    labels: Int[np.ndarray, " f"]
-    holes: int
-    turned: bool
-
-
-def _closed(body: trimesh.Trimesh, labels: np.ndarray, total_area: float, name: str) -> _Body:
-    """One connected body, closed and oriented outwards; InputError if that is impossible."""
-    area, holes = body.area, 0
-    if not body.is_watertight:
-        body, labels, holes = _fill(body, labels)
+def _closed(part: trimesh.Trimesh, labels: np.ndarray, total_area: float, name: str) -> Body:
+    """One connected part, closed and oriented outwards; InputError if that is impossible."""
+    consistent, area, count = part.is_winding_consistent, part.area, len(part.faces)
+    body, fills = part, _Fills(0, 0)
+    if not part.is_watertight:
+        body, labels, fills = _fill(part, labels)
     if not body.is_watertight:
         raise InputError(
             f"{name} is not closed and its holes cannot be filled, since edges belong to more than two faces or "
             "holes touch: repair it in a mesh editor, for instance by remeshing, and try again."
         )
-    if body.area - area > MOST_FILLED * total_area:
+    added = float(body.area - area)
+    deep = abs(body.volume) > DEEP * body.area**1.5
+    if added > (MOST_FILLED_DEEP if deep else MOST_FILLED) * total_area:
         raise InputError(
-            f"{name} is open: closing its holes would add {(body.area - area) / total_area:.0%} to its surface; "
+            f"{name} is open: closing its holes would add {added / total_area:.0%} to its surface; "
             "give the sheet a thickness or close it in a mesh editor."
         )
+    sense = int(np.sign(body.volume)) if consistent else 0
     before = body.faces.copy()
     body.fix_normals(multibody=False)
     if body.volume < LEAST_VOLUME * body.area**1.5:
         raise InputError(f"{name} encloses no volume: it is a sheet or folded into itself; give it a thickness.")
-    return _Body(body, labels, holes, turned=not np.array_equal(before, body.faces))
+    turned = not np.array_equal(before, body.faces)
+    wide = fills.count if added >= WIDE * area else fills.mouths
+    sheet = trimesh.Trimesh(body.vertices, body.faces[:count], process=False) if wide else None
+    return Body(body, labels, fills.count - wide, wide, added, sheet, turned, sense)
 
 
-def _clean(mesh: trimesh.Trimesh, labels: np.ndarray) -> tuple[trimesh.Trimesh, np.ndarray, int]:
-    """The mesh with near vertices merged and degenerate and repeated faces dropped, and the number of those.
-
-    Equal faces of opposite orientation stay: there two bodies touch. A closed mesh stays as it is, because merging
-    would join touching bodies.
-    """
-    if mesh.is_watertight:
-        return mesh, labels, 0
-    places = np.round(mesh.vertices / (MERGE_SHARE * mesh.scale)).astype(np.int64)
-    _, kept, merged = np.unique(places, axis=0, return_index=True, return_inverse=True)
-    faces = merged.ravel()[mesh.faces]
-    proper = (faces != np.roll(faces, 1, axis=1)).all(1)
-    turn = (faces.argmin(1)[:, None] + np.arange(3)) % 3
-    _, first = np.unique(np.take_along_axis(faces, turn, 1), axis=0, return_index=True)
-    single = np.zeros(len(faces), bool)
-    single[first] = True
-    good = proper & single
-    return trimesh.Trimesh(mesh.vertices[kept], faces[good], process=False), labels[good], int((~good).sum())
+def _without_buried_openings(body: Body, bodies: list[Body]) -> Body:
+    """The body, taken for solid if all its openings end inside other bodies, as those of a tube used as a handle."""
+    count = body.holes + body.mouths
+    if body.sheet is None or len(bodies) == 1:
+        return body
+    middles = np.array(body.mesh.vertices)[-count:]
+    buried = np.zeros(count, bool)
+    for other in (each.mesh for each in bodies if each is not body):
+        near = ((middles > other.bounds[0]) & (middles < other.bounds[1])).all(1)
+        buried[near] |= ExactDistance(other)(middles[near]) < 0
+    return replace(body, sheet=None, holes=count, mouths=0) if buried.all() else body
 
 
-def _fill(mesh: trimesh.Trimesh, labels: np.ndarray) -> tuple[trimesh.Trimesh, np.ndarray, int]:
-    """The mesh with every hole of simple rim closed by a fan around the rim's centre, and the number of holes."""
+@dataclass(frozen=True)
+class _Fills:
+    """Number of openings that were closed, and of those among them with a modelled rim."""
+
+    count: int
+    mouths: int
+
+
+def _fill(mesh: trimesh.Trimesh, labels: np.ndarray) -> tuple[trimesh.Trimesh, np.ndarray, _Fills]:
+    """The mesh with every hole of simple rim closed by a fan around the rim's centre; its own faces come first."""
     mesh = mesh.copy()
     trimesh.repair.fix_winding(mesh)
     edges = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
     face_of = dict(zip(map(tuple, mesh.edges.tolist()), mesh.edges_face.tolist(), strict=True))
     rims = nx.DiGraph(edges[:, ::-1].tolist())
     vertices, faces, new_labels = [np.array(mesh.vertices)], [np.array(mesh.faces)], [labels]
-    holes = 0
+    holes = mouths = 0
     for rim in nx.weakly_connected_components(rims):
         around = rims.subgraph(rim)
         if any(d != 1 for _, d in around.out_degree()) or any(d != 1 for _, d in around.in_degree()):
@@ -145,11 +234,23 @@ def _fill(mesh: trimesh.Trimesh, labels: np.ndarray) -> tuple[trimesh.Trimesh, n
         faces.append(np.column_stack([pairs, np.full(len(pairs), middle)]))
         new_labels.append(labels[[face_of[b, a] for a, b in pairs.tolist()]])
         holes += 1
+        mouths += _is_mouth(mesh.vertices[pairs], mesh.area)
     closed = trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
-    return closed, np.concatenate(new_labels), holes
+    return closed, np.concatenate(new_labels), _Fills(holes, mouths)
 
 
-def _united(bodies: list[_Body], name: str) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"]]:
+def _is_mouth(rim: np.ndarray, area: float) -> bool:
+    """Whether a rim of edges (n, 2, 3) is modelled: of many edges, plane, and round."""
+    center = rim[:, 0].mean(0)
+    length = float(np.linalg.norm(rim[:, 1] - rim[:, 0], axis=1).sum())
+    normal = np.cross(rim[:, 0] - center, rim[:, 1] - center).sum(0) / 2
+    inside = float(np.linalg.norm(normal))
+    if len(rim) < MOUTH_EDGES or inside < max(MOUTH_SHARE * area, MOUTH_ROUNDNESS * length**2):
+        return False
+    return bool((np.abs((rim[:, 0] - center) @ normal) / inside).max() < MOUTH_BEND * length)
+
+
+def _united(bodies: list[Body], name: str) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"]]:
     """The union of bodies, with the labels of its faces."""
     try:
         whole, part, face = unite([body.mesh for body in bodies])

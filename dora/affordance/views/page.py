@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import html
 import importlib
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,7 +75,7 @@ def describe(candidates: GraspCandidates, row: int) -> str:
     touching = sorted({int(f) for f in candidates.contact_finger[row] if f > 0})
     score = float(candidates.score[row])
     lines = [
-        f"**{candidates.grasp_class[row]}** (candidate {row})",
+        f"**{plain(candidates.grasp_class[row])}** (candidate {row})",
         f"- {'valid' if candidates.valid[row] else 'not valid'}",
         f"- succeeded in {100 * score:.0f} % of its executions" if np.isfinite(score) else "- not ranked",
         f"- {1000 * float(candidates.penetration[row]):.2f} mm into the object",
@@ -132,6 +135,20 @@ def _filled(values: list[Float[Tensor, "c d"]], rest: tuple[float, ...]) -> Floa
     return table.reshape(-1, len(rest))
 
 
+def plain(name: str) -> str:
+    """A name as Markdown that shows it as it is."""
+    return re.sub(r"([\\`*_{}\[\]<>#|~$&])", r"\\\1", name)
+
+
+def legend_html(title: str, table: Mapping[str, tuple[int, int, int]]) -> str:
+    """HTML of a line of names, which may hold any characters, on their colours (red, green, blue, 0 to 255)."""
+    boxes = " ".join(
+        f'<span style="background: rgb{rgb}; border-radius: 3px; padding: 0 0.5em">{html.escape(name)}</span>'
+        for name, rgb in table.items()
+    )
+    return f'<div style="padding: 0.3em 1em; line-height: 1.8">{html.escape(title)}: {boxes}</div>'
+
+
 class GraspPage:
     """A running page; callbacks of its widgets change the scene.
 
@@ -187,11 +204,7 @@ class GraspPage:
             rows.append(("Contact map", PARTS))
         with self.server.gui.add_folder("Colours"):
             for title, table in rows:
-                boxes = " ".join(
-                    f'<span style="background: rgb{rgb}; border-radius: 3px; padding: 0 0.5em">{name}</span>'
-                    for name, rgb in table.items()
-                )
-                self.server.gui.add_html(f'<div style="padding: 0.3em 1em; line-height: 1.8">{title}: {boxes}</div>')
+                self.server.gui.add_html(legend_html(title, table))
 
     def _add_widgets(self, candidates: GraspCandidates) -> None:
         gui = self.server.gui
@@ -240,9 +253,8 @@ class GraspPage:
         else:
             row = rows[first]
             label = "nothing" if self.voted[row] == NO_CONTACT else self.obj.labels[self.voted[row]]
-            self.text.content = (
-                f"grasp {first + 1} of {len(rows)}\n\n{describe(self.candidates, row)}\n- the map votes for {label}"
-            )
+            words = f"grasp {first + 1} of {len(rows)}\n\n{describe(self.candidates, row)}"
+            self.text.content = f"{words}\n- the map votes for {plain(label)}"
         self.hands.show(self.candidates.select(shown) if shown else None)
         if rows and self.colouring.value == CONTACTS:
             self._paint(self.surface.contacts(self.candidates.contact_map[rows[first]]))

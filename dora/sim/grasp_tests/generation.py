@@ -25,6 +25,7 @@ from dora.digests import digest_of
 from dora.parallel import warm_up
 from dora.progress import ProgressDisplay
 from dora.robot import RobotDescription
+from dora.sim.grasp_tests.failures import failures
 from dora.sim.grasp_tests.shake_test import ShakeTest, Validation, validate
 
 MILLIMETRES = 1000.0
@@ -154,6 +155,7 @@ def summary(generated: Generated) -> dict[str, Any]:
         "self_penetration_mm": _spread(c.self_penetration),
         "classes": counts,
         "class_shares": {name: count / valid for name, count in counts.items()},
+        "failures": failures(c, verdict),
         "energy": {name: float(value.median()) for name, value in c.energy.items()},
         "region": generated.region,
         "seed": generated.seed,

@@ -14,6 +14,7 @@ from dora.affordance.candidates import GraspCandidates
 from dora.affordance.maps.confusion import Confusion
 from dora.errors import InputError
 from dora.files import write_json
+from dora.sim.grasp_tests.failures import FEW
 from dora.sim.grasp_tests.generation import KINDS
 
 SUFFIX = ".safetensors"
@@ -50,6 +51,21 @@ def print_report(report: dict[str, Any], console: Console | None = None) -> None
     console.print(table)
     if "voting" in report:
         console.print(_votes(report["voting"]))
+    if report["valid"] < FEW * report["optimised"]:
+        console.print(_causes(report["failures"]))
+        console.print(report["failures"].get("hint", ""), highlight=False, soft_wrap=True)
+
+
+def _causes(failures: dict[str, Any]) -> Table:
+    """Number of candidates by the cause for which they are not valid."""
+    table = Table(title=f"why {failures['failed']} candidates are not valid")
+    table.add_column("cause", overflow="fold")
+    table.add_column("candidates", justify="right")
+    for cause, count in failures["causes"].items():
+        table.add_row(cause, str(count))
+    table.add_section()
+    table.add_row("of all, valid or not: the hand overlaps with itself", str(failures["self_contact"]))
+    return table
 
 
 def _energy(column: dict[str, Any], name: str) -> str:

@@ -71,6 +71,7 @@ class Trial:
     closing_shift: float
     penetration: float
     touch: HandContacts | None
+    direction: int = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +93,8 @@ class Validation:
         candidate_penetration: (c,) penetration depth of hand and object at the candidate, by geometry [m].
         self_penetration: (c,) penetration depth between links of the hand at the candidate, by geometry [m].
         test_settings: settings of the test.
+        direction: (c,) index into `DIRECTIONS` of the gravity under which the test ended; -1 if it ended under none,
+            None if that is not known.
     """
 
     reason: Int[Tensor, " c"]
@@ -105,6 +108,7 @@ class Validation:
     candidate_penetration: Float[Tensor, " c"]
     self_penetration: Float[Tensor, " c"]
     test_settings: GraspTestSettings
+    direction: Int[Tensor, " c"] | None = None
 
     @property
     def passed(self) -> Bool[Tensor, " c"]:
@@ -151,8 +155,8 @@ class ShakeTest:
         if not shift < THROWN_SHIFT:
             return Trial(Reason.THROWN, 0.0, shift, 0.0, None)
         touch = self.scene.read_contacts()
-        reason, displacement, depth = self._shake(case)
-        return Trial(reason, displacement, shift, max(touch.depth, depth), touch.in_frame(self.start))
+        reason, displacement, depth, direction = self._shake(case)
+        return Trial(reason, displacement, shift, max(touch.depth, depth), touch.in_frame(self.start), direction)
 
     def _close(self, case: Case) -> float:
         """Moves the command from the opened to the squeezing posture; returns the object's displacement [m]."""
@@ -173,14 +177,14 @@ class ShakeTest:
         self.start = scene.pose
         return shift
 
-    def _shake(self, case: Case) -> tuple[Reason, float, float]:
-        """Applies gravity along all directions; returns how it ended, displacement and penetration depth [m]."""
+    def _shake(self, case: Case) -> tuple[Reason, float, float, int]:
+        """Applies gravity along all directions; returns how it ended, displacement and depth [m], and the direction."""
         scene, physics = self.scene, self.physics
         turn = matrix_from_quaternion(torch.tensor(case.quaternion)).numpy()
         origin, farthest, depth = self.start.p, 0.0, 0.0
         push, step = scene.push, scene.step
         looks = max(1, round(self.test_settings.duration / DISPLACEMENT_INTERVAL))
-        for direction in DIRECTIONS:
+        for index, direction in enumerate(DIRECTIONS):
             force = (turn @ np.array(direction) * self.weight).astype(np.float32)
             for look in range(1, looks + 1):
                 for _ in range(physics.steps(self.test_settings.duration / looks)):
@@ -188,13 +192,13 @@ class ShakeTest:
                     step()
                 farthest = max(farthest, float(np.linalg.norm(scene.position - origin)))
                 if not farthest <= self.test_settings.displacement:
-                    return Reason.SLIPPED, farthest, depth
+                    return Reason.SLIPPED, farthest, depth, index
                 if look % round(CONTACT_INTERVAL / DISPLACEMENT_INTERVAL) == 0 or look == looks:
                     touch = scene.read_contacts()
                     depth = max(depth, touch.depth)
             if not touch.in_contact:
-                return Reason.RELEASED, farthest, depth
-        return Reason.PASSED, farthest, depth
+                return Reason.RELEASED, farthest, depth, index
+        return Reason.PASSED, farthest, depth, -1
 
 
 def validate(
@@ -244,6 +248,7 @@ def validate(
         candidate_penetration=candidates.penetration.cpu(),
         self_penetration=candidates.self_penetration.cpu(),
         test_settings=test_settings,
+        direction=torch.tensor([trial.direction for trial in trials]),
     )
 
 
