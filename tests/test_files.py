@@ -7,7 +7,15 @@ import torch
 from safetensors.torch import save_file
 
 from dora.errors import InputError
-from dora.files import METADATA, read_safetensors, read_tensors, write_bytes, write_csv, write_safetensors, write_tensors
+from dora.files import (
+    METADATA,
+    read_safetensors,
+    read_tensors,
+    write_bytes,
+    write_csv,
+    write_safetensors,
+    write_tensors,
+)
 
 KIND = "dora-test 1"
 TENSORS = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.tensor([True, False])}
@@ -24,7 +32,8 @@ def path(tmp_path: Path) -> Path:
 def test_tensors_and_metadata_come_back(path: Path):
     tensors, note = read_tensors(path, KIND)
     assert note == NOTE
-    assert set(tensors) == set(TENSORS) and all(torch.equal(tensors[name], TENSORS[name]) for name in TENSORS)
+    assert set(tensors) == set(TENSORS)
+    assert all(torch.equal(tensors[name], TENSORS[name]) for name in TENSORS)
 
 
 @pytest.mark.parametrize("kind", ["dora-test 2", "dora-other 1"])
@@ -39,7 +48,7 @@ def test_each_required_entry_of_a_header_counts(tmp_path: Path, wrong: str):
     required, path = {"format": "dora-test", "version": "1"}, tmp_path / "two.safetensors"
     write_safetensors(path, TENSORS, {**required, wrong: "another"})
     with pytest.raises(InputError, match="make it again"):
-        read_safetensors(path, "test file", required)
+        read_safetensors(path, "test file", {k: (v,) for k, v in required.items()})
 
 
 def test_every_damaged_byte_is_found(path: Path):
@@ -79,7 +88,8 @@ def test_a_failed_write_keeps_the_former_file(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr("dora.files.os.fsync", full)
     with pytest.raises(InputError, match="No space left"):
         write_bytes(path, b"new")
-    assert path.read_bytes() == b"former" and [p.name for p in tmp_path.iterdir()] == ["kept"]
+    assert path.read_bytes() == b"former"
+    assert [p.name for p in tmp_path.iterdir()] == ["kept"]
 
 
 def test_a_file_can_be_read_by_others(tmp_path: Path):

@@ -26,7 +26,8 @@ from dora.agents.checkpoint import read_checkpoint
 from dora.agents.config import LEARNER_CONFIGS, Agent, Numbers, RunConfig, Settings
 from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed, outcome
 from dora.agents.evaluation.play import checkpoint_path, evaluate_checkpoint, evaluate_zero, load_policy, record
-from dora.agents.runs.recommended import check, recommended
+from dora.agents.limits import check
+from dora.agents.runs.recommended import recommended
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.agents.runs.trainer import Trainer
 from dora.configs import plain

@@ -12,9 +12,11 @@ import yaml
 import dora
 from dora.agents.config import RunConfig, config_from_dict
 from dora.agents.evaluation.evaluate import Evaluation
+from dora.agents.limits import check
 from dora.configs import plain
 from dora.errors import InputError
 from dora.files import write_bytes, write_csv, write_json
+from dora.reading import read_yaml
 
 PACKAGES = ("dora", "mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 """Packages whose versions are written."""
@@ -97,15 +99,15 @@ class RunFolder:
         Raises:
             InputError: if this is not a run folder, or its settings do not fit this version.
         """
+        path = self.path / "config.yaml"
+        if not path.is_file():
+            raise InputError(f"{self.path} is not a run folder (no readable config.yaml): give one that a run printed.")
+        config = config_from_dict(read_yaml(path, "file of settings"), f"the settings in {path}")
         try:
-            content = yaml.safe_load((self.path / "config.yaml").read_text())
-        except (OSError, yaml.YAMLError, ValueError) as error:
-            raise InputError(
-                f"{self.path} is not a run folder (no readable config.yaml): give one that a run printed."
-            ) from error
-        if not isinstance(content, dict):
-            raise InputError(f"{self.path / 'config.yaml'} holds no settings: give a folder that a run printed.")
-        return config_from_dict(content)
+            check(config)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        return config
 
     def write_curve(self, rows: list[list[Any]]) -> None:
         """Write `curve.csv`."""
