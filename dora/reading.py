@@ -33,7 +33,7 @@ MOST_YAML = 100_000
 """Largest number of values in a YAML file; what an alias stands for counts each time."""
 MOST_DOTS = 200
 """Largest number of dots in a line of a TOML file; keys with more parts take quadratic time."""
-MOST_ELEMENTS = 100_000
+MOST_ELEMENTS = 20_000
 """Largest number of elements in an XML file."""
 SCALARS = (str, int, float, bool, type(None))
 """Types of values besides lists and mappings."""
@@ -189,23 +189,35 @@ def checked(content: Any, source: str, most: int) -> Any:
 
 
 def read_xml(path: Path, what: str, most: int = MOST_TEXT) -> ElementTree.Element:
-    """Root element of an XML file; arguments and errors as for `read_bytes`, and for what is no XML, too deep or too
-    large, or declares entities or a document type."""
-    content = read_bytes(path, what, most)
+    """Root element of an XML file; arguments and errors as for `read_bytes`, and as for `checked_xml`."""
+    return checked_xml(read_bytes(path, what, most), str(path), MOST_ELEMENTS)
+
+
+def checked_xml(content: bytes, source: str, most: int) -> ElementTree.Element:
+    """Root element of an XML text.
+
+    Args:
+        content: to parse.
+        source: names it in messages.
+        most: largest number of elements.
+
+    Raises:
+        InputError: it is no XML, too deep or too large, or declares entities or a document type.
+    """
     depth = count = 0
 
     def begin(_name: str, _attributes: Any) -> None:
         nonlocal depth, count
         depth, count = depth + 1, count + 1
-        if depth > DEEPEST or count > MOST_ELEMENTS:
-            raise InputError(f"{path} has more than {MOST_ELEMENTS} elements or {DEEPEST} levels: reduce it.")
+        if depth > DEEPEST or count > most:
+            raise InputError(f"{source} has more than {most} elements or {DEEPEST} levels: reduce it.")
 
     def end(_name: str) -> None:
         nonlocal depth
         depth -= 1
 
     def refuse(*_: Any) -> None:
-        raise InputError(f"{path} declares a document type or entities, which are not read: remove them.")
+        raise InputError(f"{source} declares a document type or entities, which are not read: remove them.")
 
     parser = expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = begin, end
@@ -216,7 +228,7 @@ def read_xml(path: Path, what: str, most: int = MOST_TEXT) -> ElementTree.Elemen
     except InputError:
         raise
     except Exception as error:  # the encodings that a file may name raise errors of their own
-        raise InputError(f"{path} is not valid XML ({error}): correct it.") from error
+        raise InputError(f"{source} is not valid XML ({error}): correct it.") from error
 
 
 def read_array(path: Path, what: str, most: int) -> np.ndarray:

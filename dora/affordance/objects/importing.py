@@ -14,18 +14,24 @@ from dora.affordance.objects.affordance_object import UPRIGHT, AffordanceObject,
 from dora.affordance.objects.decomposition import THRESHOLD, decompose
 from dora.affordance.objects.labels import WHOLE, FaceLabels, grasp_class, read_labels
 from dora.affordance.objects.surface_repair import repair
-from dora.errors import InputError
+from dora.containers import MOST_BYTES, MOST_FACES, check_container
+from dora.errors import InputError, shown
+from dora.reading import read_bytes
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Factor from each unit of length to metres [m]."""
 SMALLEST, LARGEST = 0.005, 2.0
 """Range of the longest side of an object, outside of which its unit is most likely wrong [m]."""
-MOST_FACES = 200_000
-"""Largest number of faces of a mesh."""
+KINDS = (".3mf", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+"""Endings of the mesh files that are read."""
 DENSITY = 600.0
 """Density where no mass is given, that of wood [kg/m^3]."""
 STABLE = 0.002
 """Smallest distance of the centre of mass from the outline of the foot at which an object stands as modelled [m]."""
+
+
+class TooLarge(InputError):
+    """A mesh of more than `MOST_FACES` faces."""
 
 
 def import_object(
@@ -40,7 +46,7 @@ def import_object(
     """An object from a file. Axes are kept, the origin moves to the centre of mass.
 
     Args:
-        path: file in OBJ, STL, PLY, GLB, OFF or another format of trimesh. Several bodies are united.
+        path: file of one of `KINDS`. Several bodies are united.
         labels: file of labels, see `dora.affordance.objects.labels.read_labels`; if None, the regions are the named
             bodies of the file, else its materials, else the whole mesh.
         scale: factor of all lengths [1].
@@ -93,46 +99,63 @@ def read_mesh(path: Path, keep_order: bool = False) -> tuple[trimesh.Trimesh, li
     Raises:
         InputError: it cannot be read, holds no triangles, too many, or coordinates that are not finite.
     """
-    if not path.is_file():
-        raise InputError(f"there is no mesh file {path}.")
-    scene = _load(
+    if path.suffix.lower() not in KINDS:
+        raise InputError(f"{path} cannot be read as a mesh: give a file ending in {', '.join(KINDS)}.")
+    check_container(path)
+    parts = _load(
         path,
         {"maintain_order": True, "skip_materials": True}
         if keep_order
         else {"split_objects": True, "group_material": False},
     )
-    parts = _parts(scene)
     if path.suffix.lower() == ".obj" and not keep_order and len(parts) == 1:
-        parts = _parts(_load(path, {}))
+        parts = _load(path, {})
     if not parts:
         raise InputError(f"{path} holds no triangles: export the surface of the object as a triangle mesh.")
     mesh = cast(trimesh.Trimesh, trimesh.util.concatenate([part for _, part in parts]))
-    if len(mesh.faces) > MOST_FACES:
-        raise InputError(f"{path} has {len(mesh.faces)} faces; reduce it to at most {MOST_FACES} in a mesh editor.")
     if not np.isfinite(mesh.vertices).all():
         raise InputError(f"{path} has coordinates that are not finite; export it again.")
     return mesh, [name for name, part in parts for _ in range(len(part.faces))]
 
 
-def _load(path: Path, options: dict[str, Any]) -> trimesh.Scene:
-    """The scene that trimesh reads from a file; `options` apply to OBJ files alone."""
+class _Neighbours(trimesh.resolvers.FilePathResolver):
+    """Files that a mesh file names: only plain ones of bounded size, in its folder or below."""
+
+    def get(self, name: str) -> bytes:
+        folder = Path(str(self.parent)).resolve()
+        path = (folder / name.strip()).resolve()
+        if not path.is_relative_to(folder):
+            raise InputError(f"it names the file {shown(name)}, which does not lie beside it")
+        return read_bytes(path, "file that a mesh names", MOST_BYTES)
+
+
+def _load(path: Path, options: dict[str, Any]) -> list[tuple[str, trimesh.Trimesh]]:
+    """The parts of the scene that trimesh reads from a file; `options` apply to OBJ files alone."""
     own = options if path.suffix.lower() == ".obj" else {}
     try:
-        return trimesh.load_scene(path, process=False, **own)
+        return _parts(trimesh.load_scene(path, resolver=_Neighbours(str(path)), process=False, **own), path)
+    except TooLarge:
+        raise
     except Exception as error:  # the readers of some twenty formats raise whatever they meet
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path} cannot be read ({reason}): export it as OBJ, STL, PLY or GLB.") from error
 
 
-def _parts(scene: trimesh.Scene) -> list[tuple[str, trimesh.Trimesh]]:
+def _parts(scene: trimesh.Scene, path: Path) -> list[tuple[str, trimesh.Trimesh]]:
     """Triangle meshes of a scene in its frame, named by body if these names differ, else by material."""
     placed, order = [], {name: i for i, name in enumerate(scene.geometry)}
-    for node in sorted(scene.graph.nodes_geometry, key=lambda node: (order[scene.graph[node][1]], node)):
-        pose, name = scene.graph[node]
+    nodes = [(scene.graph[node], node) for node in scene.graph.nodes_geometry]
+    count = sum(len(getattr(scene.geometry[name], "faces", ())) for (_, name), _ in nodes)
+    if count > MOST_FACES:
+        raise TooLarge(f"{path} has {count} faces; reduce it to at most {MOST_FACES} in a mesh editor.")
+    for (pose, name), _ in sorted(nodes, key=lambda each: (order[each[0][1]], each[1])):
         part = scene.geometry[name]
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
             material = getattr(getattr(part.visual, "material", None), "name", None)
-            placed.append((name, material or name, part.copy().apply_transform(pose)))
+            if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
+                raise InputError("it has faces that name vertices which do not exist")
+            bare = trimesh.Trimesh(part.vertices, part.faces, process=False)
+            placed.append((name, str(material or name), bare.apply_transform(pose)))
     bodies = {_without_number(name) for name, _, _ in placed}
     materials = {material for _, material, _ in placed}
     if len(bodies) > 1:

@@ -18,6 +18,8 @@ MOST_FILLED = 0.3
 """Largest ratio of the area of filled holes to that of the mesh [1]."""
 DEBRIS = 0.01
 """Share of the area up to which a component that cannot be closed is dropped [1]."""
+MOST_BODIES = 1000
+"""Largest number of connected parts; each takes a few milliseconds [1]."""
 LEAST_VOLUME = 1e-4
 """Smallest ratio of volume to area^1.5 [1]; a ball has 0.094, a sheet 0."""
 
@@ -47,6 +49,11 @@ def repair(mesh: trimesh.Trimesh, labels: Int[np.ndarray, " f"], name: str) -> R
     mesh, labels, dropped = _clean(mesh, labels)
     bodies, debris, holes = [], 0, 0
     groups = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1)
+    if len(groups) > MOST_BODIES:
+        raise InputError(
+            f"{name} falls into {len(groups)} parts that do not hang together, and may have {MOST_BODIES}: "
+            "export closed surfaces, or drop loose faces in a mesh editor."
+        )
     for group in groups:
         body = trimesh.Trimesh(mesh.vertices, mesh.faces[group], process=False)
         body.remove_unreferenced_vertices()
