@@ -69,6 +69,18 @@ def write_bytes(path: Path, content: bytes) -> None:
             Path(temporary).unlink(missing_ok=True)
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it, unless it exists.
+
+    Raises:
+        InputError: it cannot be made, or a file has its name.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise InputError(f"Cannot make the folder {folder} ({error}): choose another one.") from error
+
+
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Replace `path` by a JSON object, atomically.
 

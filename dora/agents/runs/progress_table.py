@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from dora.agents.runs.stored_results import LARGEST, MOST_COLUMNS, MOST_TABLE
 from dora.errors import InputError
 from dora.files import write_bytes
+from dora.reading import read_bytes
 
 COLUMNS = ("env_steps", "seconds", "episodes", "success_rate", "raw_success_rate", "return_mean", "penetration_mm")
 """First columns; those of the stages follow. Rates and means are over the episodes that ended in the iteration."""
@@ -19,16 +21,25 @@ STAGE = "stage/"
 
 def read_progress(path: Path) -> dict[str, Float[np.ndarray, " rows"]]:
     """Columns of the table by name, NaN where a cell is empty. A row that was being written when its run was killed is
-    left out, with all that follow it."""
+    left out, with all that follow it.
+
+    Raises:
+        InputError: it is too large, or its first line is damaged.
+    """
     header, rows = _whole_rows(path)
+    if not set(COLUMNS) <= set(header) or len(set(header)) < len(header):
+        raise InputError(f"{path} is damaged (its first line lacks a column, or has one twice): remove it.")
     values = np.array([[float(cell or "nan") for cell in row] for row in rows]).reshape(len(rows), len(header))
     return {name: values[:, k] for k, name in enumerate(header)}
 
 
 def _whole_rows(path: Path) -> tuple[list[str], list[list[str]]]:
     """Header and rows as text, up to the first row that is damaged."""
-    lines = path.read_text(errors="replace").split("\n")[:-1]  # what no line break ends is torn
+    content = read_bytes(path, "progress.csv", MOST_TABLE).decode("utf-8", "replace")
+    lines = content.split("\n")[:-1]  # what no line break ends is torn
     header = lines[0].split(",") if lines else []
+    if len(header) > MOST_COLUMNS:
+        raise InputError(f"{path} is damaged (it has {len(header)} columns): remove it.")
     rows = []
     for line in lines[1:]:
         cells = line.split(",")
@@ -40,10 +51,9 @@ def _whole_rows(path: Path) -> tuple[list[str], list[list[str]]]:
 
 def _is_cell(text: str) -> bool:
     try:
-        float(text or "nan")
+        return not abs(float(text or "nan")) >= LARGEST
     except ValueError:
         return False
-    return True
 
 
 class ProgressTable:
