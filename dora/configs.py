@@ -2,7 +2,6 @@
 
 import dataclasses
 import difflib
-import math
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, get_type_hints
 
@@ -14,6 +13,8 @@ C = TypeVar("C")
 """A frozen dataclass whose fields are numbers, texts, tuples or such dataclasses."""
 
 
+LARGEST = 1e12
+"""Every number of a configuration is smaller."""
 LARGEST_WHOLE = 10**300
 """Largest whole number that stands for a float."""
 
@@ -136,11 +137,11 @@ def check_ranges(
     for name, (low, high) in ranges.items():
         value = getattr(config, name, None)
         if value is not None and not low <= value <= high:
-            raise InputError(f"{name_of(name)} is {shown(value)} and has to be from {low:g} to {high:g}.")
+            raise InputError(f"{name_of(name)} is {shown(value)} and has to be from {low:.12g} to {high:.12g}.")
 
 
 def check_finite(config: Any, what: str) -> None:
-    """Refuses a configuration that holds NaN or infinity.
+    """Refuses a configuration that holds NaN, infinity or a number as large as `LARGEST`.
 
     Args:
         config: a configuration, or a value of one.
@@ -155,8 +156,8 @@ def check_finite(config: Any, what: str) -> None:
     elif isinstance(config, tuple | list):
         for value in config:
             check_finite(value, what)
-    elif isinstance(config, float) and not math.isfinite(config):
-        raise InputError(f"{what} is {config}; it has to be a finite number.")
+    elif isinstance(config, int | float) and not isinstance(config, bool) and not abs(config) < LARGEST:
+        raise InputError(f"{what} is {shown(config)}; it has to be a finite number below {LARGEST:g}.")
 
 
 def check_not_negative(config: Any, what: str) -> None:

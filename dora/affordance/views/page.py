@@ -246,7 +246,8 @@ class GraspPage:
         else:
             row = rows[first]
             label = "nothing" if self.voted[row] == NO_CONTACT else self.obj.labels[self.voted[row]]
-            self.text.content = f"grasp {first + 1} of {len(rows)}\n\n{describe(self.candidates, row)}\n- the map votes for {markdown_text(label)}"
+            about, voted = describe(self.candidates, row), markdown_text(label)
+            self.text.content = f"grasp {first + 1} of {len(rows)}\n\n{about}\n- the map votes for {voted}"
         self.hands.show(self.candidates.select(shown) if shown else None)
         if rows and self.colouring.value == CONTACTS:
             self._paint(self.surface.contacts(self.candidates.contact_map[rows[first]]))
