@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.metadata
+import os
 import platform
 import subprocess
 from pathlib import Path
@@ -20,6 +21,9 @@ from dora.reading import read_yaml
 
 PACKAGES = ("dora", "mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 """Packages whose versions are written."""
+OWN_FILES = ("config.yaml", "result.json", "curve.csv", "eval.csv", "progress.csv", "checkpoints/latest.safetensors",
+             "checkpoints/best.safetensors")  # fmt: skip
+"""Files by which a folder is known to hold a run."""
 CURVE_HEADER = (
     "env_steps",
     "wall_seconds",
@@ -72,14 +76,32 @@ class RunFolder:
         """Folder of films."""
         return self.path / "video"
 
+    def check_free(self) -> None:
+        """Refuse a folder in which no run can be begun, before any work.
+
+        Raises:
+            InputError: if it holds a run already, or cannot be made or written.
+        """
+        try:
+            found = [name for name in OWN_FILES if (self.path / name).exists()]
+            above = next(path for path in (self.path, *self.path.absolute().parents) if path.exists())
+            fits = above.is_dir() and os.access(above, os.W_OK | os.X_OK)
+        except (OSError, ValueError) as error:
+            raise InputError(f"Cannot make the run folder {self.path} ({error}): choose another --out.") from error
+        if found:
+            raise InputError(
+                f"{self.path} holds a run already ({found[0]}): continue it with --resume or choose another --out."
+            )
+        if not fits:
+            raise InputError(f"Cannot make the run folder {self.path} (nothing can be written): choose another --out.")
+
     def create(self, config: RunConfig) -> None:
         """Make the folder and write `config.yaml` and `versions.txt`.
 
         Raises:
             InputError: if it cannot be written or holds a run already.
         """
-        if (self.path / "config.yaml").exists():
-            raise InputError(f"{self.path} holds a run already: continue it with --resume or choose another --out.")
+        self.check_free()
         try:
             self.checkpoints.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -100,7 +100,7 @@ class DoraEnv(BaseEnv):
     ):
         options = check_options(
             guidance, guidance_parts, hand_joints, task_config(self.TASK.CONFIG, preset, config), robot_uids,
-            len(self.TASK.ARMS), num_envs, control_mode, sim_backend, render_backend, render_mode, obs_mode,
+            len(self.TASK.ARMS), num_envs, control_mode, sim_backend, render_backend, render_mode, obs_mode, kwargs,
         )  # fmt: skip
         if grasps is not None and len(self.TASK.ARMS) > 1:
             raise InputError(f"grasps are of one arm, and there are {', '.join(self.TASK.ARMS)}: leave them out")

@@ -1,14 +1,17 @@
 """The options that every Dora task takes, checked before anything is built."""
 
-from collections.abc import Mapping, Sequence
+import difflib
+import inspect
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from mani_skill.agents.registration import REGISTERED_AGENTS
+from mani_skill.envs.sapien_env import BaseEnv
 
-from dora.configs import check_finite, check_not_negative, overridden
-from dora.errors import InputError
+from dora.configs import check_finite, check_not_negative, check_ranges, overridden
+from dora.errors import InputError, shown
 from dora.robot import available_robots
 from dora.sim.batch.rendering import can_render
 from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot
@@ -16,6 +19,15 @@ from dora.sim.robots import register_robot
 from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import guidance_in_force
 from dora.tasks.mdp.randomisation import find_preset
+
+MORE = ("preset", "grasps")
+"""Options of a task that `check_options` does not check."""
+RATES = {"control_frequency": (1, 10_000), "physics_frequency": (1, 1_000_000), "solver_iterations": (1, 255)}
+"""Lowest and highest rates [Hz], and position iterations, of which PhysX takes 255."""
+MOST_DELAY = 1000
+"""Largest delay of an action [control steps]."""
+MOST_ENVS = 100_000
+"""Largest number of environments of a batch [1]."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +59,11 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Mapping[str, Any] |
         if getattr(config.randomisation, name) >= 1:
             width = getattr(config.randomisation, name)
             raise InputError(f"config.randomisation.{name} is {width}; it is a share and has to be below 1.")
-    for name in ("control_frequency", "physics_frequency", "solver_iterations"):
-        if getattr(config, name) < 1:
-            raise InputError(f"config.{name} is {getattr(config, name)}; it has to be at least 1.")
+    low, high = config.randomisation.friction
+    if not 0 <= low <= high:
+        raise InputError(f"config.randomisation.friction is {low, high}; it has to be a lowest and a highest value.")
+    check_ranges(config, RATES, lambda name: f"config.{name}")
+    check_ranges(config.randomisation, {"delay": (0, MOST_DELAY)}, lambda name: f"config.randomisation.{name}")
     if config.physics_frequency % config.control_frequency:
         raise InputError(
             f"config.physics_frequency is {config.physics_frequency} Hz; it has to be a multiple of "
@@ -71,6 +85,7 @@ def check_options(
     render_backend: str,
     render_mode: str | None,
     obs_mode: str | None,
+    others: Collection[str] = (),
 ) -> TaskOptions:
     """Resolves defaults and refuses what cannot be built.
 
@@ -80,13 +95,14 @@ def check_options(
     Raises:
         InputError: one sentence about the first option that is wrong.
     """
+    _check_names(others)
     parts = guidance_in_force(guidance, guidance_parts)
     if hand_joints not in (15, 20):
         raise InputError(
             f"hand_joints must be 20, or 15 with distal joints coupled to medial ones, not {hand_joints!r}"
         )
-    if not isinstance(num_envs, int) or num_envs < 1:
-        raise InputError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
+    if not isinstance(num_envs, int) or not 1 <= num_envs <= MOST_ENVS:
+        raise InputError(f"num_envs must be a whole number from 1 to {MOST_ENVS}, not {shown(num_envs)}")
     robots = _robots(robot_uids, arms)
     mode = control_mode or CONTROL_MODES[0]
     if hand_joints == 15 and not mode.endswith(COUPLED):
@@ -99,6 +115,17 @@ def check_options(
     if render_backend == "auto":
         render_backend = choose_render_backend(render_mode, obs_mode)
     return TaskOptions(parts, config, robots, mode, sim_backend, render_backend)
+
+
+def _check_names(others: Collection[str]) -> None:
+    """Refuses a keyword that neither a Dora task nor ManiSkill's environments have, naming the nearest one."""
+    known = {*inspect.signature(BaseEnv.__init__).parameters, *inspect.signature(check_options).parameters, *MORE}
+    for name in others:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            raise InputError(
+                f"there is no option {name!r}: {f'did you mean {near[0]!r}?' if near else 'leave it out.'}"
+            )
 
 
 def _robots(robot_uids: Any, arms: int) -> tuple[str, ...]:
