@@ -22,6 +22,8 @@ MOST_ENTRIES = 1000
 """Largest number of files in a zip file [1]."""
 MOST_INSTANCES = 10_000
 """Largest number of nodes, primitives, or copies of parts [1]."""
+MOST_COMPONENTS = 1000
+"""Largest number of copies of parts in a 3MF file, whose reader takes some milliseconds for each [1]."""
 MOST_NUMBERS = 10_000_000
 """Largest number of elements that the accessors and primitives of a glTF file declare [1]."""
 MOST_XML = 2_000_000
@@ -107,26 +109,28 @@ def _check_3mf(path: Path) -> None:
             for entry in entries:
                 if entry.filename.lower().endswith((".model", ".xml", ".rels")):
                     root = checked_xml(archive.read(entry), f"{entry.filename} in {path}", MOST_XML)
-                    for item in root.iter("{*}object"):
-                        parts = [part.get("objectid", "") for part in item.iter("{*}component")]
-                        below.setdefault(item.get("id", ""), []).extend(parts)
-            copies(below, below, path)
+                    for item in root.iter():
+                        if item.tag.endswith("}object") or item.tag == "object":
+                            parts = [part.get("objectid", "") for part in item.iter() if part.tag.endswith("component")]
+                            below.setdefault(item.get("id", ""), []).extend(parts)
+            copies(below, below, path, MOST_COMPONENTS)
     except InputError:
         raise
     except Exception as error:  # zipfile and zlib raise several kinds for what is damaged
         raise InputError(f"{path} is no intact 3MF file ({type(error).__name__}): export it again.") from error
 
 
-def copies(below: Mapping[Any, Sequence[Any]], roots: Iterable[Any], path: Path) -> int:
+def copies(below: Mapping[Any, Sequence[Any]], roots: Iterable[Any], path: Path, most: int = MOST_INSTANCES) -> int:
     """Number of parts below the roots, if all that repeat each other were written out.
 
     Args:
         below: by part, the parts that it contains; unknown ones count once.
         roots: parts at which counting begins.
         path: of the file, for messages.
+        most: largest number of parts below a root.
 
     Raises:
-        InputError: a part contains itself, or there are more than `MOST_INSTANCES` below a root.
+        InputError: a part contains itself, or there are more than `most` below a root.
     """
     sizes: dict[Any, int] = {}
     for root in roots:
@@ -138,8 +142,8 @@ def copies(below: Mapping[Any, Sequence[Any]], roots: Iterable[Any], path: Path)
             if part in sizes or not missing:
                 sizes.setdefault(part, 1 + sum(sizes[each] for each in inside))
                 open_parts.discard(waiting.pop())
-                if sizes[part] > MOST_INSTANCES:
-                    raise InputError(f"{path} repeats its parts more than {MOST_INSTANCES} times: write them out.")
+                if sizes[part] > most:
+                    raise InputError(f"{path} repeats its parts more than {most} times: join them.")
                 continue
             open_parts.add(part)
             if any(each in open_parts for each in missing):

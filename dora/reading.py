@@ -31,10 +31,12 @@ MOST_VALUES = 1_000_000
 """Largest number of values in a file of JSON or TOML."""
 MOST_YAML = 100_000
 """Largest number of values in a YAML file; what an alias stands for counts each time."""
-MOST_DOTS = 200
+MOST_DOTS = 100
 """Largest number of dots in a line of a TOML file; keys with more parts take quadratic time."""
 MOST_ELEMENTS = 20_000
 """Largest number of elements in an XML file."""
+UNICODE, LAST_CHARACTER = {"<": "<u4", ">": ">u4", "=": "u4"}, 0x10FFFF
+"""Types of the codes of characters by byte order, and the largest code."""
 SCALARS = (str, int, float, bool, type(None))
 """Types of values besides lists and mappings."""
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -101,6 +103,8 @@ def parse_json(text: str, source: str) -> Any:
     Raises:
         InputError: it is no JSON, or is too deep or too large.
     """
+    if text.count(",") > MOST_VALUES:
+        raise InputError(f"{source} holds more than {MOST_VALUES} values: reduce it.")
     return checked(_parsed(json.loads, text, "JSON", source), source, MOST_VALUES)
 
 
@@ -247,4 +251,8 @@ def read_array(path: Path, what: str, most: int) -> np.ndarray:
         raise InputError(f"{path} holds {kind}, not numbers or texts: write it with another dtype.")
     if any(size < 0 for size in shape) or math.prod(shape) * kind.itemsize != left or not kind.itemsize:
         raise InputError(f"{path} declares {tuple(shape)} values of {kind} and has {left} bytes: write it again.")
+    if kind.kind == "U":
+        codes = np.frombuffer(content, UNICODE[kind.byteorder], offset=stream.tell())
+        if ((codes > LAST_CHARACTER) | ((codes >= 0xD800) & (codes <= 0xDFFF))).any():
+            raise InputError(f"{path} holds texts with codes that are no characters: write it again.")
     return np.frombuffer(content, kind, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")

@@ -152,6 +152,8 @@ def _parts(scene: trimesh.Scene, path: Path) -> list[tuple[str, trimesh.Trimesh]
         part = scene.geometry[name]
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
             material = getattr(getattr(part.visual, "material", None), "name", None)
+            if np.shape(part.vertices)[1:] != (3,) or np.shape(part.faces)[1:] != (3,):
+                raise InputError("it has points or faces that are not three numbers")
             if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
                 raise InputError("it has faces that name vertices which do not exist")
             bare = trimesh.Trimesh(part.vertices, part.faces, process=False)

@@ -51,11 +51,14 @@ def smoothed(
         weights: of the values, such as the episodes over which each is a mean.
         sigma: standard deviation of the Gaussian [environment steps].
     """
-    known = np.isfinite(values) & (weights > 0)
-    kernel = np.exp(-0.5 * ((at[:, None] - steps[known]) / sigma) ** 2) * weights[known]
-    total = kernel.sum(1)
-    with np.errstate(invalid="ignore"):
-        return np.where(total > 1e-12, kernel @ values[known] / total, np.nan)
+    known = np.isfinite(steps) & np.isfinite(values) & (weights > 0)
+    steps, values, weights = steps[known], values[known], weights[known]
+    found = np.full(len(at), np.nan)
+    for k, place in enumerate(at):  # one after the other, so that the memory does not grow with both
+        kernel = np.exp(-0.5 * ((place - steps) / sigma) ** 2) * weights
+        if (total := kernel.sum()) > 1e-12:
+            found[k] = kernel @ values / total
+    return found
 
 
 def draw_curves(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
@@ -124,10 +127,10 @@ def _draw_training(axes: Any, groups: dict[Group, list[Run]], colours: dict[Grou
     for axis, (column, label) in zip(axes, TRAINING, strict=True):
         for group, members in groups.items():
             colour, curves = colours.get(group, COLOURS.get(group[2:4])), []
-            at = np.linspace(0, min(m.progress["env_steps"].max(initial=0.0) for m in members), GRID)
+            at = np.linspace(0, min(np.nanmax(m.progress["env_steps"], initial=0.0) for m in members), GRID)
             for m in members:
                 steps, values, episodes = (m.progress[name] for name in ("env_steps", column, "episodes"))
-                curves.append(smoothed(at, steps, values, episodes, m.budget * SIGMA / EPOCHS))
+                curves.append(smoothed(at, steps, values, episodes, max(m.budget, 1) * SIGMA / EPOCHS))
                 known = np.isfinite(values)
                 (line,) = axis.plot(steps[known] / 1e3, values[known], color=colour, alpha=0.15, linewidth=0.6)
                 colour = colours[group] = line.get_color()

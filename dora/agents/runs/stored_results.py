@@ -10,6 +10,8 @@ from dora.reading import read_json, read_text
 
 MOST_RESULT, MOST_TABLE = 1_000_000, 16_000_000
 """Size of a result.json and of a table above which it is not read [bytes]."""
+MOST_ROWS, MOST_CURVE = 200_000, 20_000
+"""Largest number of rows of a progress.csv and of a curve.csv [1]."""
 MOST_COLUMNS, LONGEST_NAME = 1000, 200
 """Largest number of columns of a table, and of characters of a text [1]."""
 LARGEST = 1e12
@@ -70,7 +72,8 @@ def read_result(path: Path) -> dict[str, Any] | None:
     try:
         result = read_json(path, "result.json", MOST_RESULT)
     except InputError as error:
-        raise InputError(f"{path} is damaged ({error}); repeat the run or remove its folder.") from error
+        reason = str(error).rstrip(".").removeprefix(f"{path} ")
+        raise InputError(f"{path} is damaged ({reason}); repeat the run or remove its folder.") from error
     if not isinstance(result, dict):
         raise InputError(f"{path} is damaged (it is no mapping); repeat the run or remove its folder.")
     finished = result.get("finished", False)
@@ -107,6 +110,8 @@ def read_curve(path: Path) -> list[dict[str, float]]:
             if any(abs(value) >= LARGEST for value in row.values()):
                 raise ValueError(f"line {lines.line_num} has a number out of range")
             rows.append(row)
+            if len(rows) > MOST_CURVE:
+                raise ValueError(f"it has more than {MOST_CURVE} rows")
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path} is damaged ({error}); remove it, or repeat the run.") from error
     return rows
