@@ -239,7 +239,7 @@ def test_archives(tmp_path: Path):
     with refused("packed .gzip."):
         read_mesh(written(tmp_path / "a.obj", b"\x1f\x8b\x08"))
     parts = "".join(
-        f'<object id="{i}"><components>{f"<component objectid='{i + 1}'/>" * 4}</components></object>'
+        f'<object id="{i}"><components>' + f'<component objectid="{i + 1}"/>' * 4 + "</components></object>"
         for i in range(1, 30)
     )
     namespace = 'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"'

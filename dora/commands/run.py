@@ -111,6 +111,8 @@ def settings_to_start_from(words: Sequence[str]) -> RunConfig:
                 raise InputError(f"{option} does not go with --resume, which goes on in its folder: leave it out.")
         return RunFolder(Path(resume)).read_config()
     preset = early_value(words, "--preset")
+    if preset is not None:
+        find_preset(preset)
     if "--eval-only" in words and checkpoint is None and not ("--zero-correction" in words and env is not None):
         raise InputError(
             "--eval-only needs --checkpoint with a .safetensors file or a run folder, or --zero-correction with --env."
