@@ -16,6 +16,8 @@ MOST_BYTES = 64_000_000
 """Size of a mesh file above which it is not read [bytes]."""
 MOST_FACES = 200_000
 """Largest number of faces of a mesh."""
+MOST_LINES, MOST_ROWS = 1_500_000, 600_000
+"""Largest number of lines of a mesh in text: OBJ with normals and textures, and OFF or PLY [1]."""
 MOST_UNPACKED = 128_000_000
 """Size of the content of a zip file above which it is not unpacked [bytes]."""
 MOST_ENTRIES = 1000
@@ -26,7 +28,7 @@ MOST_COMPONENTS = 1000
 """Largest number of copies of parts in a 3MF file, whose reader takes some milliseconds for each [1]."""
 MOST_NUMBERS = 10_000_000
 """Largest number of elements that the accessors and primitives of a glTF file declare [1]."""
-MOST_XML = 2_000_000
+MOST_XML = 350_000
 """Largest number of elements in an XML file of a mesh [1]."""
 PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"7z\xbc\xaf": "7z", b"\x28\xb5\x2f\xfd": "zstd"}
 """Kinds of archives by their first bytes."""
@@ -52,11 +54,31 @@ def check_container(path: Path) -> None:
         _check_3mf(path)
     elif start.startswith(b"PK"):
         raise InputError(f"{path} is a zip file, which is not read: unpack it.")
+    elif ending in (".obj", ".off", ".ply"):
+        check_lines(path)
     elif ending == ".glb":
         size = int.from_bytes(start[12:16], "little")
         _check_gltf(path, read_bytes(path, "mesh file", MOST_BYTES)[20 : 20 + size])
     elif ending == ".gltf":
         _check_gltf(path, read_bytes(path, "mesh file", MOST_BYTES))
+
+
+def check_lines(path: Path) -> None:
+    """Refuses a mesh in text (OBJ, OFF, or PLY in ASCII) with more lines than a mesh of `MOST_FACES` faces has.
+
+    Raises:
+        InputError: naming the file.
+    """
+    content = read_bytes(path, "mesh file", MOST_BYTES)
+    ending = path.suffix.lower()
+    if ending == ".ply" and b"format ascii" not in content[:1000]:
+        return
+    lines, most = content.count(b"\n") + content.count(b"\r"), MOST_LINES if ending == ".obj" else MOST_ROWS
+    faces = content.count(b"\nf") + content.count(b"\rf") if ending == ".obj" else 0
+    if faces > MOST_FACES:
+        raise InputError(f"{path} has {faces} faces; reduce it to at most {MOST_FACES} in a mesh editor.")
+    if lines > most or (ending == ".off" and len(content) > MOST_BYTES // 2):
+        raise InputError(f"{path} has {lines} lines, and may have {most}: reduce the mesh.")
 
 
 def check_triangles(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:

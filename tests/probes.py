@@ -188,6 +188,7 @@ def write_mesh(ending: str, folder: Path) -> None:
     if ending in ("glb", "gltf", "3mf"):
         found = scene.export(file_type=ending)
         for name, content in found.items() if isinstance(found, dict) else [(f"thing.{ending}", found)]:
+            assert isinstance(content, bytes)
             (folder / name.replace("model.gltf", "thing.gltf")).write_bytes(content)
     else:
         box().export(folder / f"thing.{ending}")

@@ -218,6 +218,20 @@ def test_gltf(tmp_path: Path, header: Any, words: str):
         read_mesh(written(tmp_path / "a.glb", glb(header if isinstance(header, bytes) else header or b"[]")))
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3\n" * 200_001, "200001 faces"),
+        ("a.obj", "v 0 0 0\n" * 1_500_001, "1500001 lines"),
+        ("a.off", "OFF\n3 600000 0\n" + "0 0 0\n" * 600_000, "600002 lines"),
+        ("a.ply", "ply\nformat ascii 1.0\n" + "0 0 0\n" * 600_000, "600002 lines"),
+    ],
+)
+def test_meshes_in_text_have_a_limit_of_lines(tmp_path: Path, name: str, content: str, words: str):
+    with refused(words):
+        read_mesh(written(tmp_path / name, content))
+
+
 @pytest.mark.parametrize("name", ["/dev/zero", "../../etc/passwd", "/etc/passwd"])
 def test_a_mesh_reads_no_files_elsewhere(tmp_path: Path, name: str):
     content = MESH | {"buffers": [{"uri": name, "byteLength": 10}]}

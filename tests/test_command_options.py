@@ -53,7 +53,8 @@ def test_numbers_of_a_run(option: str, value: str):
 def test_every_number_of_a_run_has_a_range():
     """A new setting without a range is noticed here."""
     from dora.agents.config import LEARNER_CONFIGS, RunConfig
-    from dora.agents.limits import LEARNER, RUN as RANGES
+    from dora.agents.limits import LEARNER
+    from dora.agents.limits import RUN as RANGES
 
     own = RunConfig("x", "ppo")
     assert {n for n, v in vars(own).items() if type(v) in (int, float)} - {"stop_success"} == set(RANGES) - {

@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from trimesh.resolvers import FilePathResolver
 
 from dora.affordance.objects.affordance_object import UPRIGHT, AffordanceObject, Piece, assemble
 from dora.affordance.objects.decomposition import THRESHOLD, decompose
@@ -118,7 +119,7 @@ def read_mesh(path: Path, keep_order: bool = False) -> tuple[trimesh.Trimesh, li
     return mesh, [name for name, part in parts for _ in range(len(part.faces))]
 
 
-class _Neighbours(trimesh.resolvers.FilePathResolver):
+class _Neighbours(FilePathResolver):
     """Files that a mesh file names: only plain ones of bounded size, in its folder or below."""
 
     def get(self, name: str) -> bytes:

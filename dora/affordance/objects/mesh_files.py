@@ -14,7 +14,7 @@ from jaxtyping import Int
 from trimesh.exchange.ply import load_ply
 
 from dora.affordance.objects.palette import PALETTE, colours
-from dora.containers import MOST_BYTES, check_triangles
+from dora.containers import MOST_BYTES, check_lines, check_triangles
 from dora.errors import InputError
 from dora.files import write_bytes
 
@@ -68,6 +68,7 @@ def read_ply(path: Path) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"] | None]
         raise InputError(f"there is no mesh file {path}; put it there or correct its name.")
     if path.stat().st_size > MOST_BYTES:
         raise InputError(f"{path} has {path.stat().st_size} bytes; reduce the mesh to at most {MOST_BYTES}.")
+    check_lines(path)
     try:
         with path.open("rb") as stream:
             content = load_ply(stream, fix_texture=False, skip_materials=True)
