@@ -4,9 +4,8 @@ import reprlib
 
 LONGEST = 1200
 """Characters of a message above which its middle is left out."""
-_SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = 80
-_SHORT.maxlevel = 3
+LONGEST_VALUE, DEEPEST_VALUE = 80, 3
+"""Characters and levels of a value in a message, beyond which it is cut."""
 
 
 class InputError(ValueError):
@@ -24,4 +23,7 @@ class InputError(ValueError):
 
 def shown(value: object) -> str:
     """A value as a message shows it: its `repr`, cut to a few dozen characters and a few levels."""
-    return _SHORT.repr(value)
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = LONGEST_VALUE
+    short.maxlevel = DEEPEST_VALUE
+    return short.repr(value)

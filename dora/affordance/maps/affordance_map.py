@@ -27,7 +27,7 @@ STORED = {
     "points": ("n", 3, False), "normals": ("n", 3, False), "areas": ("n", 0, False), "labels": ("n", 0, True),
     "vertices": ("v", 3, False), "faces": ("f", 3, True), "face_labels": ("f", 0, True),
 }  # fmt: skip
-"""Tensors of a file: what their rows are (points, vertices, faces), numbers in a row, and whether they are whole."""
+"""Tensors of a file: of what they have rows, numbers in a row, and whether they are whole."""
 CANDIDATES_PER_NEIGHBOUR, FEWEST_CANDIDATES = 6, 48
 """Points stored per cell of the nearest-point table: this many per neighbour asked for, and at least the second."""
 
