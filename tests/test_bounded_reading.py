@@ -351,7 +351,7 @@ def test_results_of_another_type(tmp_path: Path, name: str, value: Any):
 def test_names_from_files_are_text_in_figures_and_on_pages(tmp_path: Path):
     write_result(tmp_path)
     result = json.loads((tmp_path / "result.json").read_text())
-    name = "$\\frac{_<b>[x](y)"
+    name = "$\\frac{$_<b>[x](y)"
     written(tmp_path / "result.json", json.dumps(result | {"env": name, "guidance": "$x_{$"}))
     table, page, _ = write_report(tmp_path, tmp_path / "out")
     assert "<b>" not in table.read_text() + page.read_text()
