@@ -2,21 +2,27 @@
 
 import dataclasses
 import difflib
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, get_type_hints
 
 import dacite
 
-from dora.errors import InputError
+from dora.errors import InputError, shown
 
 C = TypeVar("C")
 """A frozen dataclass whose fields are numbers, texts, tuples or such dataclasses."""
 
 
+LARGEST = 1e12
+"""Every number of a configuration is smaller."""
+LARGEST_WHOLE = 10**300
+"""Largest whole number that stands for a float."""
+
+
 def _number(value: Any) -> Any:
-    """Whole numbers are floats as well; a bool is neither."""
-    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+    """Whole numbers are floats as well, if they are not too large for one; a bool is neither."""
+    whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) <= LARGEST_WHOLE
+    return float(value) if whole else value
 
 
 RULES = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _number})
@@ -48,11 +54,12 @@ def overridden(config: C, changes: Any, what: str) -> C:
     if isinstance(changes, type(config)):
         return changes
     if not isinstance(changes, Mapping):
-        raise InputError(f"{what} must be a mapping of names to values or a {type(config).__name__}, not {changes!r}.")
+        name = type(config).__name__
+        raise InputError(f"{what} must be a mapping of names to values or a {name}, not {shown(changes)}.")
     try:
         return dacite.from_dict(type(config), _merged(plain(config), changes, what), RULES)
-    except dacite.DaciteError as error:
-        raise InputError(f"{what}: {_sentence(error)}.") from error
+    except (dacite.DaciteError, TypeError, ValueError) as error:
+        raise _refusal(error, what) from error
 
 
 def _merged(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -61,7 +68,7 @@ def _merged(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> d
         if name not in values:
             near = difflib.get_close_matches(str(name), values, 1)
             hint = f"did you mean {near[0]!r}?" if near else f"choose among {', '.join(values)}."
-            raise InputError(f"{where} has no field {str(name)!r}: {hint}")
+            raise InputError(f"{where} has no field {shown(str(name))}: {hint}")
         if isinstance(value, bool) and not isinstance(values[name], bool | None):
             raise InputError(f"{where}.{name} must be a number or a text, not {value}.")
         if isinstance(values[name], dict) and isinstance(value, Mapping):
@@ -71,16 +78,30 @@ def _merged(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> d
     return merged
 
 
+def _refusal(error: Exception, what: str) -> InputError:
+    """What is wrong with plain data; casts raise errors of their own."""
+    if isinstance(error, InputError):
+        return error
+    if isinstance(error, dacite.DaciteError):
+        return InputError(f"{what}: {_sentence(error)}.")
+    return InputError(f"{what} has a value of the wrong type ({error}): correct it.")
+
+
 def _sentence(error: dacite.DaciteError) -> str:
     """What is wrong with a field, without a full stop."""
     if isinstance(error, dacite.WrongTypeError):
         wanted = getattr(error.field_type, "__name__", str(error.field_type))
-        return f"{error.field_path} must be {wanted}, not {error.value!r}"
+        return f"{error.field_path} must be {wanted}, not {shown(error.value)}"
     return str(error).rstrip(".")
 
 
-def built(cls: type[C], values: Mapping[str, Any]) -> C:
+def built(cls: type[C], values: Mapping[str, Any], what: str = "settings") -> C:
     """A configuration of plain data, its types checked; fields of generic types are taken as they are.
+
+    Args:
+        cls: class of the configuration.
+        values: by the names of its fields.
+        what: how messages call them.
 
     Raises:
         InputError: a name is missing or unknown, or a value has the wrong type.
@@ -88,15 +109,39 @@ def built(cls: type[C], values: Mapping[str, Any]) -> C:
     known = {f.name: f for f in dataclasses.fields(cls)}  # pyright: ignore[reportArgumentType]
     hints = {name: Any if isinstance(hint, TypeVar) else hint for name, hint in get_type_hints(cls).items()}
     loose = dataclasses.make_dataclass(cls.__name__, [(n, hints[n], f) for n, f in known.items()], kw_only=True)
+    for name in values:
+        if name not in known:
+            near = difflib.get_close_matches(str(name), known, 1)
+            hint = f"did you mean {near[0]!r}?" if near else "remove it."
+            raise InputError(f"{what}: there is no {shown(name)}; {hint}")
     try:
         checked = dacite.from_dict(loose, values, RULES)
-    except dacite.DaciteError as error:
-        raise InputError(f"settings: {_sentence(error)}.") from error
+    except (dacite.DaciteError, TypeError, ValueError) as error:
+        raise _refusal(error, what) from error
     return cls(**{name: getattr(checked, name) for name in known})
 
 
+def check_ranges(
+    config: Any, ranges: Mapping[str, tuple[int | float, int | float]], name_of: Callable[[str], str]
+) -> None:
+    """Refuses numbers of a configuration outside their ranges; NaN is outside of all, and None is no number.
+
+    Args:
+        config: a configuration; a field that it does not have is left out.
+        ranges: lowest and highest value by field.
+        name_of: how messages call a field.
+
+    Raises:
+        InputError: naming the first such number and its range.
+    """
+    for name, (low, high) in ranges.items():
+        value = getattr(config, name, None)
+        if value is not None and not low <= value <= high:
+            raise InputError(f"{name_of(name)} is {shown(value)} and has to be from {low:.12g} to {high:.12g}.")
+
+
 def check_finite(config: Any, what: str) -> None:
-    """Refuses a configuration that holds NaN or infinity.
+    """Refuses a configuration that holds NaN, infinity or a number as large as `LARGEST`.
 
     Args:
         config: a configuration, or a value of one.
@@ -111,8 +156,8 @@ def check_finite(config: Any, what: str) -> None:
     elif isinstance(config, tuple | list):
         for value in config:
             check_finite(value, what)
-    elif isinstance(config, float) and not math.isfinite(config):
-        raise InputError(f"{what} is {config}; it has to be a finite number.")
+    elif isinstance(config, int | float) and not isinstance(config, bool) and not abs(config) < LARGEST:
+        raise InputError(f"{what} is {shown(config)}; it has to be a finite number below {LARGEST:g}.")
 
 
 def check_not_negative(config: Any, what: str) -> None:

@@ -1,35 +1,41 @@
-"""Atomic writing of files, and safetensors files with a digest that detects damage."""
+"""Atomic writing of files, and safetensors files with a digest of the whole file that detects any damage."""
 
-import codecs
+import contextlib
 import csv
 import hashlib
 import io
 import json
 import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from dora.errors import InputError
+from dora.reading import check_size, parse_json
 
 METADATA = "metadata"
-"""Entry of a file's header with the metadata of `write_tensors`, which its digest covers."""
+"""Entry of a file's header with the metadata of `write_tensors`."""
+WHOLE = "file_sha256"
+"""Entry of a header with the sha256 of the whole file, in which this entry's digits are zeros."""
+FIRST = "sha256"
+"""The same entry in files of the first format: sha256 of the tensors and `METADATA`, not of the rest of the header."""
+ZEROS = "0" * 64
+"""What stands for the digits of the digest while it is computed."""
+MOST_BYTES = 2**29
+"""Size of a safetensors file above which it is not read [bytes]."""
+MOST_HEADER = 4_000_000
+"""Size of the header of a safetensors file above which it is not read [bytes]."""
+CHUNK = 2**20
+"""Size of the pieces in which a file's digest is computed [bytes]."""
 
-
-def decoded(content: bytes) -> str:
-    """Text in UTF-8, with or without a byte order mark, or in UTF-16 with one.
-
-    Raises:
-        UnicodeDecodeError: it is neither.
-    """
-    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    return content.decode("utf-16" if wide else "utf-8-sig")
+Content = TypeVar("Content")
+"""What a file of a cache holds."""
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -61,6 +67,18 @@ def write_bytes(path: Path, content: bytes) -> None:
     finally:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it, unless it exists.
+
+    Raises:
+        InputError: it cannot be made, or a file has its name.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise InputError(f"Cannot make the folder {folder} ({error}): choose another one.") from error
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
@@ -104,46 +122,120 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, An
     """Tensors and metadata of a file written by `write_tensors`.
 
     Raises:
-        InputError: the file is missing, truncated, damaged, or of another format or version than `kind`.
+        InputError: the file is missing, too large, truncated, damaged, or of another format or version than `kind`.
     """
-    tensors, header = read_safetensors(path, f"{kind} file", {"format": kind})
-    return tensors, json.loads(header[METADATA])
+    tensors, header = read_safetensors(path, f"{kind} file", {"format": (kind,)})
+    metadata = parse_json(header.get(METADATA, "null"), f"the header of {path}")
+    if not isinstance(metadata, dict):
+        raise InputError(f"{path} has no metadata: use another file, or make it again.")
+    return tensors, metadata
 
 
 def write_safetensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
-    """Replace `path` by a safetensors file with a header and, in it, a digest of the tensors."""
+    """Replace `path` by a safetensors file with a header and, in it, a digest of the whole file.
+
+    Raises:
+        InputError: as `write_bytes`, or the header is larger than `MOST_HEADER`.
+    """
     own = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
-    write_bytes(path, save(own, {**header, "sha256": _digest(own, header)}))
+    content = save(own, {**header, WHOLE: ZEROS})
+    size = 8 + int.from_bytes(content[:8], "little")
+    if size > MOST_HEADER:
+        raise InputError(f"{path} would have a header of {size} bytes; at most {MOST_HEADER} can be read again.")
+    digest = hashlib.sha256(content).hexdigest()
+    place = content.index(_entry(ZEROS), 0, size) + len(_entry(""))
+    write_bytes(path, b"".join((content[:place], digest.encode(), content[place + len(ZEROS) :])))
 
 
-def read_safetensors(path: Path, what: str, required: Mapping[str, str]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and header of a file written by `write_safetensors`.
+def read_safetensors(
+    path: Path, what: str, required: Mapping[str, Sequence[str]]
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and header of a file written by `write_safetensors`, every byte of which its digest covers.
+
+    Files of the first format, with another digest, are read as well; what it does not cover is their header but for
+    `METADATA`.
 
     Args:
         path: of the file.
         what: it is, for messages.
-        required: entries that its header must have, such as format and version.
+        required: entries that its header must have, such as format and version, with the values that are accepted.
 
     Raises:
-        InputError: if it is missing, truncated, damaged, or lacks a required entry.
+        InputError: if it is missing, too large, truncated, damaged, or lacks a required entry.
     """
-    if not path.is_file():
-        raise InputError(f"There is no {what} {path}: give the path of one (.safetensors).")
+    check_size(path, what, MOST_BYTES)
+    unusable = f"{path} is truncated, damaged or no {what}"
     try:
+        if not _header_fits(path):
+            raise InputError(f"{unusable} (the size of its header is wrong): use another one.")
         with safe_open(path, framework="pt") as stream:
             header = stream.metadata() or {}
+            if any(header.get(name) not in values for name, values in required.items()):
+                found = header.get("format", "another format")
+                raise InputError(
+                    f"{path} is {found}, no {what} of this version of Dora: use another one, or make it again."
+                )
+            whole = _whole_digest(path, header.get(WHOLE, ""))
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{path} is truncated, damaged or no {what} ({error}): use another one.") from error
-    if any(header.get(name) != value for name, value in required.items()):
-        found = header.get("format", "another format")
-        raise InputError(f"{path} is {found}, no {what} of this version of Dora: use another one, or make it again.")
-    if header.get("sha256") != _digest(tensors, header):
+        intact = header[WHOLE] == whole if WHOLE in header else header.get(FIRST) == _first_digest(tensors, header)
+    except InputError:
+        raise
+    except Exception as error:  # safetensors and torch raise several kinds for what they cannot represent
+        raise InputError(f"{unusable} ({type(error).__name__}: {error}): use another one.") from error
+    if not intact:
         raise InputError(f"{path} is damaged (its digest differs): use another one, or make it again.")
     return tensors, header
 
 
-def _digest(tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> str:
+def stored_or_made(
+    path: Path, load: Callable[[Path], Content], make: Callable[[], Content], save: Callable[[Path, Content], None]
+) -> Content:
+    """What a file of a cache holds, or what is made where there is no intact file.
+
+    A cache that cannot be written is done without.
+
+    Args:
+        path: of the file.
+        load: reads it, and raises InputError if it is damaged.
+        make: makes the content.
+        save: writes it.
+    """
+    with contextlib.suppress(InputError, OSError):
+        if path.is_file():
+            return load(path)
+    content = make()
+    with contextlib.suppress(InputError, OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save(path, content)
+    return content
+
+
+def _entry(digits: str) -> bytes:
+    """The bytes of a header up to the end of the digits of its digest."""
+    return f'"{WHOLE}":"{digits}'.encode()
+
+
+def _header_fits(path: Path) -> bool:
+    """Whether the header ends within the file and is not too large, so that it may be parsed."""
+    with path.open("rb") as stream:
+        size = int.from_bytes(stream.read(8), "little")
+    return size <= min(MOST_HEADER, path.stat().st_size - 8)
+
+
+def _whole_digest(path: Path, digits: str) -> str:
+    """sha256 of a file in which zeros replace the digits of its digest; "" if they do not stand there once."""
+    with path.open("rb") as stream:
+        start = stream.read(8)
+        start += stream.read(int.from_bytes(start, "little"))
+        if len(digits) != len(ZEROS) or start.count(_entry(digits)) != 1:
+            return ""
+        digest = hashlib.sha256(start.replace(_entry(digits), _entry(ZEROS)))
+        while piece := stream.read(CHUNK):
+            digest.update(piece)
+    return digest.hexdigest()
+
+
+def _first_digest(tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> str:
     """sha256 over names, types, shapes and values of CPU tensors, and over the metadata of `write_tensors`."""
     digest = hashlib.sha256(header.get(METADATA, "").encode())
     for name in sorted(tensors):

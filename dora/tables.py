@@ -1,5 +1,6 @@
 """Tables as Markdown, HTML pages and text on a terminal: by jinja2, which escapes what comes from files, and rich."""
 
+import html
 import io
 import sys
 from collections.abc import Sequence
@@ -9,6 +10,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+MARKS = "\\`*_{}[]~$"
+"""Characters within a line that Markdown may read as marks; bars are escaped by tables."""
 _PLAIN, _ESCAPED = jinja2.Environment(), jinja2.Environment(autoescape=True)
 """Templates of text, and of pages in which values are escaped."""
 _MARKDOWN = _PLAIN.from_string("""\
@@ -30,6 +33,12 @@ def show_any_script() -> None:
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table, without a line break at its end. Cells are Markdown, but for bars, which are escaped."""
     return _MARKDOWN.render(head=head, rows=rows)
+
+
+def markdown_text(text: str) -> str:
+    """A text from a file as Markdown that shows it: HTML, marks and line breaks are escaped."""
+    plain = html.escape(" ".join(text.split()), quote=False)
+    return "".join(f"\\{c}" if c in MARKS else c for c in plain)
 
 
 def html_page(template: str, **values: object) -> str:

@@ -119,7 +119,7 @@ def test_the_preset_is_the_randomisation_that_can_be_overridden(env_id: str):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"control_frequency": 0}, "at least 1"),
+        ({"control_frequency": 0}, "is 0 and has to be from 1 to 10000"),
         ({"physics_frequency": 110}, "multiple of config.control_frequency, 20 Hz"),
         ({"lift": None}, "lift must be float"),
     ],

@@ -48,7 +48,7 @@ def test_each_required_entry_of_a_header_counts(tmp_path: Path, wrong: str):
     required, path = {"format": "dora-test", "version": "1"}, tmp_path / "two.safetensors"
     write_safetensors(path, TENSORS, {**required, wrong: "another"})
     with pytest.raises(InputError, match="make it again"):
-        read_safetensors(path, "test file", required)
+        read_safetensors(path, "test file", {k: (v,) for k, v in required.items()})
 
 
 def test_every_damaged_byte_is_found(path: Path):

@@ -298,8 +298,8 @@ def test_label_files(name: str, content, names: tuple[str, ...], index: list[int
         ("a.json", {"labels": ["cup"], "faces": ["cup", "cup", "lid", "cup"]}, "labels face 2 'lid'"),
         ("a.json", {"labels": ["cup"], "faces": [0, 0, 0, 0], "target": "lid"}, "target 'lid'; choose one of: cup"),
         ("a.json", {"colours": []}, "nothing else"),
-        ("a.json", "{", "no valid .json file"),
-        ("a.yaml", "regions: [", "no valid .yaml file"),
+        ("a.json", "{", "is not valid JSON"),
+        ("a.yaml", "regions: [", "is not valid YAML"),
         ("a.yaml", {"regions": {"rim": {"ball": {}}}}, "must be box"),
         ("a.yaml", {"regions": {"rim": {"box": {"min": [0, 0], "max": [1, 1]}}}}, "must be box"),
         (

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from dora.affordance.objects.affordance_object import moved
 from dora.affordance.objects.folder_reading import read_object_folder
 from dora.affordance.objects.folder_writing import write_object_folder
-from dora.affordance.objects.mesh_files import MOST_BYTES, write_ply
+from dora.affordance.objects.mesh_files import write_ply
+from dora.containers import MOST_BYTES
 from dora.errors import InputError
 
 
@@ -57,9 +58,9 @@ QUADS = (
 DAMAGES: dict[str, tuple[Callable[[Path], object], str, str]] = {
     "no toml": (lambda f: (f / "object.toml").unlink(), "box", "has no object.toml"),
     "no TOML at all": (edited("format =", "format"), "object.toml", "not valid TOML"),
-    "not text": (lambda f: (f / "object.toml").write_bytes(b"\xff\xfe\0"), "object.toml", "not valid TOML"),
+    "not text": (lambda f: (f / "object.toml").write_bytes(b"\xff\xfe\0"), "object.toml", "no UTF-8 text"),
     "deep": (lambda f: (f / "object.toml").write_text("a=" + "[" * 9000), "object.toml", "not valid TOML"),
-    "large toml": (lambda f: (f / "object.toml").write_text("#" * 1_000_001), "object.toml", "1000000 bytes"),
+    "large toml": (lambda f: (f / "object.toml").write_text("#" * 1_000_001), "object.toml", "at most 1000000"),
     "long number": (edited("mass = 0.2", "mass = " + "9" * 5000), "object.toml", "not valid TOML"),
     "unknown key": (edited("mass =", "colour = 3\nmass ="), "object.toml", "unknown key 'colour'; known: format, name"),
     "missing key": (edited("mass =", "# mass ="), "object.toml", "lacks the key 'mass'"),

@@ -32,7 +32,7 @@ def test_settings_reach_the_simulation():
 def test_bad_requests_are_refused():
     with pytest.raises(InputError, match="no multiple of the 20 Hz"):
         measure_physics("DoraCube-v1", [parse_physics("110:5:4")], 1)
-    with pytest.raises(InputError, match="at least one start"):
+    with pytest.raises(InputError, match="1 to 100000 starts"):
         measure_physics("DoraCube-v1", [], 0)
     with pytest.raises(InputError, match="DoraCube-v1"):
         measure_physics("DoraCub-v1", [parse_physics("100:5:4")], 1)

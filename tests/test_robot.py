@@ -321,7 +321,7 @@ SPOILED = {
     "a loop": (URDF, '<parent link="link2"/>', '<parent link="link4"/>', "one tree"),
     "no shape": (URDF, '<cylinder radius="0.092" length="0.022"/>', "", "a <geometry> is empty"),
     "unknown shape": (URDF, "<box size", "<ball size", "<ball> is not"),
-    "no XML": (URDF, "</robot>", "", "not a URDF"),
+    "no XML": (URDF, "</robot>", "", "not valid XML"),
     "chained coupling": (
         TOML,
         'leader = "Right_Ring_2"',

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -17,9 +16,11 @@ from torch import Tensor
 from dora.affordance.maps.packed_maps import COUNT, PART, POINT, pack, unpack
 from dora.affordance.maps.voting import HAND_PARTS
 from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.affordance.stored_candidates import TEXTS, check_stored
 from dora.digests import digest_of
 from dora.errors import InputError
 from dora.files import read_tensors, write_tensors
+from dora.reading import parse_json
 from dora.robot import RobotDescription
 
 FORMAT = "dora-grasps 1"
@@ -116,10 +117,11 @@ class GraspCandidates:
     def ranking_steps(self) -> int | None:
         """Control steps that were simulated to rank the set, as its settings say; None if they do not."""
         try:
-            made = json.loads(self.settings or "{}")
-        except ValueError:
+            made = parse_json(self.settings or "{}", "the settings of candidates")
+        except InputError:
             return None
-        return made.get("ranking_steps") if isinstance(made, dict) else None
+        steps = made.get("ranking_steps") if isinstance(made, dict) else None
+        return steps if type(steps) is int else None
 
     def __len__(self) -> int:
         return len(self.grasp_class)
@@ -184,11 +186,11 @@ class GraspCandidates:
         """
         path = Path(path)
         tensors, metadata = read_tensors(path, FORMAT)
-        classes = metadata.pop("classes")
-        names = tuple(classes[i] for i in tensors.pop("grasp_class").tolist())
         points = metadata.pop(MAP_POINTS, 0)
-        if points or {COUNT, POINT, PART} & set(tensors):
-            tensors["contact_map"] = unpack(tensors, len(names), points, str(path))
+        packed = {name: tensors.pop(name) for name in (COUNT, POINT, PART) if name in tensors}
+        names = check_stored(path, tensors, metadata)
+        if points or packed:
+            tensors["contact_map"] = unpack(packed, len(names), points, str(path))
         own, energy = _split_energy(tensors)
         candidates = cls(grasp_class=names, energy=energy, **own, **metadata)
         candidates.check_fits(path, object, robot)
@@ -220,8 +222,6 @@ class GraspCandidates:
             )
 
 
-TEXTS = ("object", "digest", "robot", "robot_digest", "settings")
-"""Names of the fields that are text."""
 FINITE = ("position", "quaternion", "approach", "pregrasp", "grasp", "joints", "contacts")
 """Names of the fields in which NaN and infinity are refused."""
 

@@ -1,6 +1,8 @@
 """Checkpoints: safetensors files with everything a run needs to go on, and what they belong to."""
 
+import contextlib
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,15 +11,19 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dora.agents.config import RunConfig, config_from_dict
+from dora.agents.config import RunConfig, config_from_dict, stored_digests
+from dora.agents.limits import check
 from dora.configs import plain
-from dora.errors import InputError
+from dora.errors import InputError, shown
 from dora.files import read_safetensors, write_safetensors
+from dora.reading import parse_json
 
 FORMAT = "dora-checkpoint"
 """Format of a checkpoint file."""
-VERSION = 1
-"""Version of that format."""
+VERSION = 2
+"""Version of that format; `read_checkpoint` says what the digests of version 1 do not cover."""
+LARGEST_SIZE = 65_536
+"""Largest number of components of an observation or action that a checkpoint may have."""
 
 
 @dataclass(frozen=True)
@@ -57,18 +63,39 @@ class Checkpoint:
 def read_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint written by `Checkpoint.write`.
 
+    The digest of the file covers every byte of it. In files of version 1 it covers the tensors alone; of the header the
+    settings are covered by `config_digest`, but `total_steps` and the counters in `progress` by nothing.
+
     Raises:
         InputError: if it is missing, truncated, damaged or something else.
     """
-    tensors, metadata = read_safetensors(path, "checkpoint", {"format": FORMAT, "version": str(VERSION)})
-    observation, action = json.loads(metadata["sizes"])
-    return Checkpoint(
-        config_from_dict(json.loads(metadata["config"])),
-        (observation, action),
-        tensors,
-        json.loads(metadata["progress"]),
-        metadata["config_digest"],
-    )
+    versions = [str(version) for version in range(1, VERSION + 1)]
+    tensors, header = read_safetensors(path, "checkpoint", {"format": (FORMAT,), "version": versions})
+    names = ("config", "sizes", "progress")
+    settings, sizes, progress = (parse_json(header.get(name, "null"), f"{name} of {path}") for name in names)
+    counts = sizes if isinstance(sizes, list) else []
+    if len(counts) != 2 or not all(type(count) is int and 0 < count <= LARGEST_SIZE for count in counts):
+        raise InputError(f"{path} has the sizes {shown(sizes)}, not two whole numbers above 0: use another checkpoint.")
+    if not isinstance(progress, dict):
+        raise InputError(f"{path} has no counters of its run: use another checkpoint.")
+    config = config_from_dict(settings, f"the settings in {path}")
+    if header.get("config_digest") not in stored_digests(settings):
+        raise InputError(f"{path} has settings that were changed (their digest differs): use another checkpoint.")
+    try:
+        check(config)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return Checkpoint(config, (sizes[0], sizes[1]), tensors, progress, header["config_digest"])
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[None]:
+    """Says in one sentence that a checkpoint is incomplete, where what is done with it fails."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise InputError(f"{path} cannot be resumed ({reason}): it is incomplete or of another version.") from error
 
 
 def check_belongs(

@@ -1,16 +1,19 @@
 """Settings of a run: what `config.yaml` holds, and their digest."""
 
 import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import tyro
-import yaml
 
 from dora.configs import built, overridden, plain
 from dora.digests import digest_of
-from dora.errors import InputError
+from dora.errors import InputError, shown
+from dora.reading import read_yaml
 
 Numbers = TypeVar("Numbers")
 """Numbers of the task: a dict of plain data, or the task's own dataclass on the command line."""
@@ -104,6 +107,8 @@ class SACConfig:
     """Widths of the hidden layers of actor and critics."""
 
 
+DIGITS = 12
+"""Hexadecimal digits of a digest of settings."""
 LEARNER_CONFIGS: dict[str, type[PPOConfig] | type[SACConfig]] = {"ppo": PPOConfig, "sac": SACConfig}
 """Settings of each learner."""
 
@@ -172,42 +177,66 @@ class RunConfig(Generic[Numbers, Settings, Agent]):
     def digest(self) -> str:
         """Twelve hexadecimal digits that differ between settings; `total_steps` may grow and is left out, and so is the
         dense reward, for settings of versions that had no other."""
-        content = plain(self)
-        del content["total_steps"]
-        if self.reward == "dense":
-            del content["reward"]
-        return digest_of(content)[:12]
+        return digest_of(_digested(plain(self)))[:DIGITS]
 
 
-def config_from_dict(content: dict[str, Any]) -> RunConfig:
+def _digested(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that enter a digest."""
+    left_out = {"total_steps"} | ({"reward"} if content.get("reward") == "dense" else set())
+    return {name: value for name, value in content.items() if name not in left_out}
+
+
+def stored_digests(content: Mapping[str, Any]) -> tuple[str, ...]:
+    """The digests that settings may have been stored with: that of `RunConfig.digest`, and that of the versions whose
+    `task` held only preset and parts of guidance."""
+    settings = _digested(content)
+    first = {name: value for name, value in settings.items() if name != "task" or value}
+    text = json.dumps(first, sort_keys=True).encode()
+    return digest_of(settings)[:DIGITS], hashlib.sha256(text).hexdigest()[:DIGITS]
+
+
+def config_from_dict(content: Any, source: str = "the settings") -> RunConfig:
     """Rebuild a `RunConfig` from what `dora.configs.plain` made of it, also of a version without numbers of the task.
+
+    Args:
+        content: plain data, as a file holds them.
+        source: names them in messages.
 
     Raises:
         InputError: if names are missing or unknown, or a value has the wrong type.
     """
-    content = upgraded(content)
+    if not isinstance(content, dict) or not all(isinstance(name, str) for name in content):
+        raise InputError(f"{source} must be a mapping of names to values, not {shown(content)}.")
+    content = upgraded(content, source)
     agent = content.get("agent")
-    if agent not in LEARNER_CONFIGS:
-        raise InputError(f"the settings name the learner {agent!r}; there are {', '.join(LEARNER_CONFIGS)}.")
+    if not isinstance(agent, str) or agent not in LEARNER_CONFIGS:
+        raise InputError(f"{source} name the learner {shown(agent)}; there are {', '.join(LEARNER_CONFIGS)}.")
     fields = dict(content, task={}, learner=None)
-    read: Any = built(RunConfig, {name: value for name, value in fields.items() if name not in ("task", "learner")})
-    learner = overridden(LEARNER_CONFIGS[agent](), content.get("learner", {}), "learner")
+    values = {name: value for name, value in fields.items() if name not in ("task", "learner")}
+    read: Any = built(RunConfig, values, source)
+    learner = overridden(LEARNER_CONFIGS[agent](), content.get("learner", {}), f"learner of {source}")
     task = content.get("task", {})
     if not isinstance(task, dict):
-        raise InputError(f"the numbers of the task must be a mapping, not {task!r}.")
+        raise InputError(f"{source} have numbers of the task that are no mapping, but {shown(task)}.")
     return dataclasses.replace(read, task=task, learner=learner)
 
 
-def upgraded(content: dict[str, Any]) -> dict[str, Any]:
+def upgraded(content: dict[str, Any], source: str = "the settings") -> dict[str, Any]:
     """Settings of a version whose `task` held only preset and parts of guidance, with the numbers that were in force.
 
     The numbers are those of `first_numbers.yaml`, written down when the tasks' numbers became settings.
+
+    Raises:
+        InputError: the preset is unknown.
     """
     if "preset" in content or not isinstance(content.get("task", {}), dict):
         return content
     options = dict(content.get("task", {}))
     preset = options.pop("preset", "standard")
-    first = yaml.safe_load((Path(__file__).parent / "first_numbers.yaml").read_text())
-    numbers = first["tasks"].get(content.get("env"))
+    first = read_yaml(Path(__file__).parent / "first_numbers.yaml", "file of numbers")
+    if preset not in list(first["presets"]):
+        raise InputError(f"{source} name the preset {shown(preset)}; there are {', '.join(first['presets'])}.")
+    env = content.get("env")
+    numbers = first["tasks"].get(env) if isinstance(env, str) else None
     task = {} if numbers is None else {**numbers, "randomisation": first["presets"][preset]}
     return {**content, "preset": preset, "guidance_parts": options.pop("guidance_parts", None), "task": task}

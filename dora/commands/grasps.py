@@ -22,6 +22,7 @@ from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.importing import import_mesh, size_in_words
 from dora.affordance.search.backends import Kinematics
 from dora.affordance.search.optimise import Settings
+from dora.configs import check_ranges
 from dora.errors import InputError
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
@@ -36,6 +37,14 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 BAD_INPUT = 2
 """Exit status after an `InputError`."""
+RANGES = {
+    "num": (1, 100_000),
+    "seed": (0, 2**31 - 1),
+    "baselines": (0, 100_000),
+    "by_region": (0, 100_000),
+    "scale": (1e-9, 1e9),
+}
+"""Lowest and highest value of options."""
 ANY = "any"
 """Value of --region for a search without a region."""
 
@@ -111,10 +120,8 @@ def described_target(args: Args) -> Target:
     """What to search grasps for, and what is known of it."""
     if (args.object is None) == (args.mesh is None):
         raise InputError("Give either --object or --mesh, for example --object jug.")
-    if args.num < 1 or args.baselines < 0:
-        raise InputError(f"--num is {args.num} and --baselines {args.baselines}: at least 1 and 0 are needed.")
-    if args.by_region < 0 or (args.by_region and args.validate == "none"):
-        raise InputError(f"--by-region is {args.by_region}: give a positive number, and --validate sapien with it.")
+    if args.by_region and args.validate == "none":
+        raise InputError(f"--by-region is {args.by_region}: give --validate sapien with it, or leave it out.")
     if args.object is not None:
         given = (args.labels, args.mass, args.density)
         if any(value is not None for value in given) or args.scale != 1 or args.units != "m":
@@ -214,6 +221,7 @@ def main() -> int:
     show_any_script()
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=description)
     try:
+        check_ranges(args, RANGES, lambda name: f"--{name.replace('_', '-')}")
         if args.make_bundle or args.rank_in_task or args.contact_maps:
             remake(args)
         else:

@@ -11,6 +11,7 @@ an option; the defaults that are shown are those of the task that --env names.
 """
 
 import datetime
+import difflib
 import functools
 import logging
 import shlex
@@ -26,7 +27,8 @@ from dora.agents.checkpoint import read_checkpoint
 from dora.agents.config import LEARNER_CONFIGS, Agent, Numbers, RunConfig, Settings
 from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed, outcome
 from dora.agents.evaluation.play import checkpoint_path, evaluate_checkpoint, evaluate_zero, load_policy, record
-from dora.agents.runs.recommended import check, recommended
+from dora.agents.limits import check
+from dora.agents.runs.recommended import recommended
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.agents.runs.trainer import Trainer
 from dora.configs import plain
@@ -45,6 +47,8 @@ BAD_INPUT = 2
 """Exit status after input that a person can mend."""
 ZERO = "zero"
 """Name of the agent that evaluates as zero correction."""
+ENTRANCES = ("--env", "--eval-only", "--checkpoint", "--resume")
+"""Options that say what is run."""
 SHOWN = "DoraHammer-v1"
 """Task whose defaults --help shows if --env names none."""
 
@@ -102,8 +106,13 @@ def settings_to_start_from(words: Sequence[str]) -> RunConfig:
     recommended ones of the task."""
     env, resume, checkpoint = (early_value(words, f"--{name}") for name in ("env", "resume", "checkpoint"))
     if resume is not None:
+        for option in ("--out", "--checkpoint", "--eval-only"):
+            if any(word.partition("=")[0] == option for word in words):
+                raise InputError(f"{option} does not go with --resume, which goes on in its folder: leave it out.")
         return RunFolder(Path(resume)).read_config()
     preset = early_value(words, "--preset")
+    if preset is not None:
+        find_preset(preset)
     if "--eval-only" in words and checkpoint is None and not ("--zero-correction" in words and env is not None):
         raise InputError(
             "--eval-only needs --checkpoint with a .safetensors file or a run folder, or --zero-correction with --env."
@@ -116,7 +125,9 @@ def settings_to_start_from(words: Sequence[str]) -> RunConfig:
     if checkpoint is not None:
         raise InputError("--checkpoint is only evaluated: add --eval-only, or go on with a run by --resume.")
     if env is None and not {"-h", "--help"} & set(words):
-        raise InputError("No task is given: add --env, for example --env DoraCube-v1.")
+        near = [word for word in words if difflib.get_close_matches(word.partition("=")[0], ENTRANCES, 1, 0.7)]
+        hint = f" instead of {near[0]}" if near else ""
+        raise InputError(f"No task is given: add --env{hint}, for example --env DoraCube-v1.")
     guidance, parts = early_value(words, "--guidance"), early_values(words, "--guidance-parts")
     return recommended(
         env or SHOWN,
@@ -182,6 +193,7 @@ def evaluate_only(args: Args) -> Path:
     path = None if args.checkpoint is None else checkpoint_path(args.checkpoint)
     agent = ZERO if path is None else config.agent
     folder = RunFolder(args.out or default_folder(config, agent, "-eval"))
+    folder.check_free()
     progress: dict[str, Any] = {"env_steps": 0, "wall_seconds": 0.0, "episodes": 0, "curve": []}
 
     def begin() -> None:

@@ -26,12 +26,15 @@ from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.importing import import_object
 from dora.affordance.views.album import write_album, write_objects
 from dora.affordance.views.page import GraspPage
+from dora.configs import check_ranges
 from dora.errors import InputError
 from dora.robot import RobotDescription, load_robot
 from dora.tables import show_any_script
 
 BAD_INPUT = 2
 """Exit status after an `InputError`."""
+RANGES = {"port": (1, 65_535), "scale": (1e-9, 1e9)}
+"""Lowest and highest value of options."""
 GRASPS = ".safetensors"
 """Suffix of a file of grasps."""
 
@@ -84,6 +87,8 @@ def opened(args: Args, source: str) -> AffordanceObject:
     """An object by its name or folder, or from a mesh file with the options for meshes."""
     if Path(source).is_file() and source not in available_objects():
         return import_object(source, labels=args.labels, scale=args.scale, units=args.units)
+    if args.labels is not None or args.scale != 1 or args.units != "m":
+        raise InputError(f"--labels, --scale and --units belong to a mesh, and {source} is none: leave them out.")
     return load_object(source)
 
 
@@ -99,6 +104,7 @@ def main() -> int:
     show_any_script()
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=description)
     try:
+        check_ranges(args, RANGES, lambda name: f"--{name}")
         if args.source is None and args.pictures is not None:
             print(write_objects(args.pictures))
             return 0

@@ -11,13 +11,14 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from dora.errors import InputError
+from dora.files import write_bytes
 from dora.geometry.rotations import rpy_from_z_axis
+from dora.reading import read_yaml
 
 Row = Mapping[str, Any]
 """One row of the parameter table."""
@@ -41,7 +42,7 @@ def build_urdf(parameters: Row) -> str:
     """
     try:
         links, joints = _expand(parameters)
-        lines = ['<?xml version="1.0"?>', HEADER, f'<robot name="{parameters["name"]}">']
+        lines = ['<?xml version="1.0"?>', HEADER, f'<robot name="{escape(parameters["name"])}">']
         for name, link in links.items():
             lines += _link_lines(name, link)
         for joint in joints:
@@ -60,8 +61,15 @@ def write_urdf(folder: Path) -> Path:
     table = folder / "parameters.yaml"
     if not table.is_file():
         raise InputError(f"{table} does not exist; give the folder of a robot that has a parameter table.")
+    content = read_yaml(table, "parameter table")
+    try:
+        text = build_urdf(content)
+    except (TypeError, ValueError, LookupError, AttributeError, OverflowError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{table} has a value of the wrong type ({error}): correct it.") from error
     target = folder / "robot.urdf"
-    target.write_text(build_urdf(yaml.safe_load(table.read_text())), newline="\n")
+    write_bytes(target, text.encode())
     return target
 
 
@@ -86,16 +94,16 @@ def _expand(parameters: Row) -> tuple[dict[str, Row], list[Row]]:
 def _link_lines(name: str, link: Row) -> list[str]:
     """`<link>` with inertial, visual and collision elements; an empty row is a bare frame."""
     if not link:
-        return [f'  <link name="{name}"/>']
+        return [f'  <link name="{escape(name)}"/>']
     inertia = " ".join(f'{k}="{_number(v)}"' for k, v in zip(INERTIA_NAMES, link["inertia"], strict=True))
     lines = [
-        f'  <link name="{name}">',
+        f'  <link name="{escape(name)}">',
         "    <inertial>",
         f"      {_origin(link['com'])}",
         f'      <mass value="{_number(link["mass"])}"/>',
         f"      <inertia {inertia}/>",
         "    </inertial>",
-        f'    <visual><geometry><mesh filename="meshes/{link["mesh"]}"/></geometry></visual>',
+        f'    <visual><geometry><mesh filename="meshes/{escape(link["mesh"])}"/></geometry></visual>',
     ]
     for shape in link.get("shapes", ()):
         for origin, geometry in _SHAPES[shape["kind"]](shape):
@@ -107,9 +115,9 @@ def _joint_lines(joint: Row) -> list[str]:
     """`<joint>`: revolute when the row has limits, fixed otherwise."""
     kind = "revolute" if "lower" in joint else "fixed"
     lines = [
-        f'  <joint name="{joint["name"]}" type="{kind}">',
-        f'    <parent link="{joint["parent"]}"/>',
-        f'    <child link="{joint["child"]}"/>',
+        f'  <joint name="{escape(joint["name"])}" type="{kind}">',
+        f'    <parent link="{escape(joint["parent"])}"/>',
+        f'    <child link="{escape(joint["child"])}"/>',
         f"    {_origin(joint['xyz'], joint['rpy'])}",
     ]
     if kind == "revolute":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Iterable
 from functools import cache
 from itertools import combinations
@@ -13,7 +12,8 @@ from typing import Any
 import numpy as np
 
 import dora
-from dora.errors import InputError
+from dora.errors import InputError, shown
+from dora.reading import read_toml
 from dora.robot.description import Contact, Coupling, Finger, JointGroup, Posture, RobotDescription
 from dora.robot.urdf import UrdfModel, read_urdf
 
@@ -25,6 +25,10 @@ SEARCH_VARIABLE = "DORA_ROBOTS"
 Table = dict[str, Any]
 """A table of a TOML file."""
 
+LARGEST_NUMBER = 1e9
+"""Every number of a robot is smaller, in SI units; limits of effort and stiffness included."""
+LONGEST_NAME = 200
+"""Largest number of characters of a name [1]."""
 KEYS = {
     "robot.toml": (
         ("name", "urdf", "wrist_link", "palm_link", "tip_radius", "arm", "hand", "fingers", "postures", "contact"),
@@ -71,11 +75,11 @@ def load_robot(name_or_folder: str | Path) -> RobotDescription:
 @cache
 def _load(folder: Path) -> RobotDescription:
     path = folder / ROBOT_FILE
-    try:
-        content = tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not valid TOML: {error}.") from error
-    return _Reader(path, read_urdf(folder / str(content.get("urdf", "robot.urdf")))).robot(content)
+    content = read_toml(path, "file about a robot")
+    urdf = content.get("urdf", "robot.urdf")
+    if not isinstance(urdf, str) or not (folder / urdf).resolve().is_relative_to(folder):
+        raise InputError(f"{path}: urdf is {shown(urdf)}; name a file in the folder of the robot.")
+    return _Reader(path, read_urdf(folder / urdf)).robot(content)
 
 
 class _Reader:
@@ -96,7 +100,7 @@ class _Reader:
             raise self.fail(f"joint {min(twice)!r} is both in arm and hand; keep it in one of them.")
         shapes = {link: shapes for link, shapes in self.model.shapes.items() if shapes}
         return RobotDescription(
-            name=str(content["name"]),
+            name=self.text(content["name"], "name"),
             folder=self.path.parent,
             urdf=self.path.parent / content["urdf"],
             model=self.model,
@@ -120,7 +124,7 @@ class _Reader:
         required, optional = KEYS[kind]
         for key in self.table(table, where):
             if key not in required + optional:
-                raise self.fail(f"{where} has the unknown key {key!r}; known: {', '.join(required + optional)}.")
+                raise self.fail(f"{where} has the unknown key {shown(key)}; known: {', '.join(required + optional)}.")
         for key in required:
             if key not in table:
                 raise self.fail(f"{where} lacks the key {key!r}; add it.")
@@ -130,23 +134,28 @@ class _Reader:
             raise self.fail(f"{where} must be a table.")
         return value
 
+    def text(self, value: Any, where: str) -> str:
+        if not isinstance(value, str) or not 0 < len(value) <= LONGEST_NAME or not value.isprintable():
+            raise self.fail(f"{where} must be a text that can be printed, of 1 to {LONGEST_NAME} characters.")
+        return value
+
     def link(self, name: Any) -> str:
-        if name not in self.model.links:
-            raise self.fail(f"the URDF has no link {name!r}; correct the name.")
+        if not isinstance(name, str) or name not in self.model.links:
+            raise self.fail(f"the URDF has no link {shown(name)}; correct the name.")
         return name
 
     def numbers(self, value: Any, length: int, where: str) -> np.ndarray:
         """A float64 array of this length; a single number stands for all."""
-        try:
-            array = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise self.fail(f"{where} must be numbers.") from error
+        entries = value if isinstance(value, list) else [value]
+        if not all(isinstance(each, int | float) and not isinstance(each, bool) for each in entries):
+            raise self.fail(f"{where} must be numbers.")
+        if not all(abs(each) < LARGEST_NUMBER for each in entries):
+            raise self.fail(f"{where} must be finite numbers below {LARGEST_NUMBER:g}.")
+        array = np.array(value, dtype=np.float64)
         if array.ndim == 0:
             array = np.full(length, array)
         if array.shape != (length,):
             raise self.fail(f"{where} needs {length} numbers and has {array.size}.")
-        if not np.isfinite(array).all():
-            raise self.fail(f"{where} must be finite numbers.")
         array.flags.writeable = False
         return array
 
@@ -203,8 +212,8 @@ class _Reader:
         """One coupling, its joints as indices into the hand group."""
         self.keys(table, "coupling", "a coupling")
         for key in ("follower", "leader"):
-            if table[key] not in hand.names:
-                raise self.fail(f"the {key} {table[key]!r} of a coupling is not a joint of the hand.")
+            if not isinstance(table[key], str) or table[key] not in hand.names:
+                raise self.fail(f"the {key} {shown(table[key])} of a coupling is not a joint of the hand.")
         factors = self.numbers([table["multiplier"], table["offset"]], 2, "a coupling's multiplier and offset")
         follower, leader = (hand.names.index(table[key]) for key in ("follower", "leader"))
         return Coupling(follower, leader, *factors.tolist())

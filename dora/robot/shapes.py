@@ -67,6 +67,7 @@ def merge_capsules(shapes: Sequence[Shape]) -> tuple[Shape, ...]:
 def _cap(spheres: Sequence[Shape], center: np.ndarray, radius: float) -> Shape | None:
     """The sphere with this centre and radius [m], if there is one."""
     for sphere in spheres:
-        if np.allclose((*sphere.position, *sphere.size), (*center, radius), rtol=0.0, atol=MERGE_TOLERANCE):
+        pairs = zip((*sphere.position, *sphere.size), (*center.tolist(), radius), strict=True)
+        if all(abs(a - b) <= MERGE_TOLERANCE for a, b in pairs):
             return sphere
     return None

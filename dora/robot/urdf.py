@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import reduce
@@ -13,12 +14,19 @@ from typing import Literal
 import numpy as np
 import torch
 
-from dora.errors import InputError
+from dora.errors import InputError, shown
 from dora.geometry.rotations import matrix_from_quaternion, quaternion_from_rpy, quaternion_multiply
+from dora.reading import read_xml
 from dora.robot.shapes import Shape, merge_capsules
 
 MOVING = ("revolute", "prismatic", "continuous")
 """Types of joints with a degree of freedom."""
+MOST_LINKS, MOST_SHAPES = 1000, 200
+"""Largest number of links of a robot, and of collision shapes of a link [1]."""
+LIMITS = ("lower", "upper", "velocity", "effort")
+"""Attributes of a joint's limits."""
+LARGEST_NUMBER = 1e9
+"""Every number of a URDF is smaller, in SI units; a larger limit stands for none, and has to be left out."""
 Z_TO_X = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)
 """Rotation (quaternion wxyz) of local x, the axis of a `Shape`, into z, the axis of a URDF cylinder."""
 
@@ -93,20 +101,17 @@ def read_urdf(path: Path) -> UrdfModel:
     """Read a URDF file.
 
     Raises:
-        InputError: there is no such file, it is not XML, a required element is missing, a name is used twice, a
-            lower limit exceeds its upper limit, or the links do not form one tree.
+        InputError: there is no such file, it is too large, it is not XML, a required element is missing, a number is
+            not finite, a name is used twice, a lower limit exceeds its upper limit, or the links do not form one tree.
     """
     if not path.is_file():
         raise InputError(f"{path} does not exist; name the URDF file in robot.toml.")
+    robot = read_xml(path, "URDF")
     try:
-        robot = ElementTree.fromstring(path.read_bytes())
         joints = [_joint(element) for element in robot.findall("joint")]
         links = [_text(element, "name") for element in robot.findall("link")]
-        shapes = {
-            _text(link, "name"): merge_capsules([_shape(element) for element in link.findall("collision")])
-            for link in robot.findall("link")
-        }
-    except (ElementTree.ParseError, ValueError) as error:
+        shapes = {_text(link, "name"): _shapes(link) for link in robot.findall("link")}
+    except ValueError as error:
         raise InputError(f"{path} is not a URDF that Dora can read: {error}.") from error
     _check_tree(path, links, joints)
     root = next(iter(set(links) - {joint.child for joint in joints}))
@@ -126,9 +131,11 @@ def _breadth_first(root: str, joints: Iterable[UrdfJoint]) -> list[UrdfJoint]:
 
 def _check_tree(path: Path, links: list[str], joints: list[UrdfJoint]) -> None:
     for kind, names in (("link", links), ("joint", [joint.name for joint in joints])):
-        twice = sorted({name for name in names if names.count(name) > 1})
+        twice = sorted(name for name, count in Counter(names).items() if count > 1)
         if twice:
             raise InputError(f"{path} has two {kind}s named {twice[0]!r}; give each its own name.")
+    if max(len(links), len(joints)) > MOST_LINKS:
+        raise InputError(f"{path} has more than {MOST_LINKS} links or joints: leave some out.")
     known, children = set(links), [joint.child for joint in joints]
     for joint in joints:
         for link in (joint.parent, joint.child):
@@ -136,8 +143,6 @@ def _check_tree(path: Path, links: list[str], joints: list[UrdfJoint]) -> None:
                 raise InputError(f"{path}: joint {joint.name!r} names the link {link!r}, which is missing.")
         if joint.lower > joint.upper:
             raise InputError(f"{path}: joint {joint.name!r} has its lower limit above its upper limit.")
-        if not np.isfinite([joint.lower, joint.upper, joint.velocity, joint.effort]).all() and joint.moves:
-            raise InputError(f"{path}: joint {joint.name!r} needs finite limits, velocity and effort.")
     roots = known - set(children)
     if len(roots) != 1 or len(children) != len(known) - 1 or len(_breadth_first(min(roots), joints)) != len(children):
         raise InputError(f"{path}: the links must form one tree with a single root.")
@@ -146,21 +151,34 @@ def _check_tree(path: Path, links: list[str], joints: list[UrdfJoint]) -> None:
 def _joint(element: ElementTree.Element) -> UrdfJoint:
     kind, name = _text(element, "type"), _text(element, "name")
     limit, axis = element.find("limit"), element.find("axis")
+    if kind not in (*MOVING, "fixed"):
+        raise ValueError(f"joint {name!r} is of the type {shown(kind)}, not one of {', '.join(MOVING)}, fixed")
     if kind in MOVING and limit is None:
         raise ValueError(f"joint {name!r} has no <limit>")
-    values = {} if limit is None else limit.attrib
+    try:
+        values = {} if limit is None else {key: _float(limit, key) for key in LIMITS if key in limit.attrib}
+    except ValueError as error:
+        raise ValueError(f"joint {name!r} needs finite limits, velocity and effort: {error}") from error
+    direction = (1.0, 0.0, 0.0) if axis is None else _floats(axis, "xyz")
+    if kind in MOVING and not any(direction):
+        raise ValueError(f"the axis of joint {name!r} has no direction")
     return UrdfJoint(
         name=name,
         kind=kind,
         parent=_text(_child(element, "parent"), "link"),
         child=_text(_child(element, "child"), "link"),
         origin=_pose_matrix(*_origin(element)),
-        axis=np.array([1.0, 0.0, 0.0] if axis is None else _floats(axis, "xyz")),
-        lower=float(values.get("lower", 0.0)),
-        upper=float(values.get("upper", 0.0)),
-        velocity=float(values.get("velocity", 0.0)),
-        effort=float(values.get("effort", 0.0)),
+        axis=np.array(direction),
+        **{key: values.get(key, 0.0) for key in LIMITS},
     )
+
+
+def _shapes(link: ElementTree.Element) -> tuple[Shape, ...]:
+    """The collision shapes of a link, capsules merged."""
+    found = link.findall("collision")
+    if len(found) > MOST_SHAPES:
+        raise ValueError(f"a link has {len(found)} collision shapes, and may have {MOST_SHAPES}")
+    return merge_capsules([_shape(element) for element in found])
 
 
 def _shape(collision: ElementTree.Element) -> Shape:
@@ -170,6 +188,8 @@ def _shape(collision: ElementTree.Element) -> Shape:
     if geometry.tag not in _SIZES:
         raise ValueError(f"collision geometry <{geometry.tag}> is not a box, sphere or cylinder")
     kind, size = _SIZES[geometry.tag](geometry)
+    if min(size) <= 0:
+        raise ValueError(f"a collision <{geometry.tag}> has a size that is not positive")
     position, quaternion = _origin(collision)
     if kind == "cylinder":
         quaternion = _compose(quaternion, Z_TO_X)
@@ -178,8 +198,8 @@ def _shape(collision: ElementTree.Element) -> Shape:
 
 _SIZES: dict[str, Callable[[ElementTree.Element], tuple[Literal["box", "sphere", "cylinder"], tuple[float, ...]]]] = {
     "box": lambda e: ("box", tuple(v / 2 for v in _floats(e, "size"))),
-    "sphere": lambda e: ("sphere", (float(_text(e, "radius")),)),
-    "cylinder": lambda e: ("cylinder", (float(_text(e, "radius")), float(_text(e, "length")) / 2)),
+    "sphere": lambda e: ("sphere", (_float(e, "radius"),)),
+    "cylinder": lambda e: ("cylinder", (_float(e, "radius"), _float(e, "length") / 2)),
 }
 """Kind and `Shape.size` of each geometry element."""
 
@@ -222,7 +242,19 @@ def _text(element: ElementTree.Element, attribute: str) -> str:
 
 
 def _floats(element: ElementTree.Element, attribute: str) -> tuple[float, ...]:
-    values = tuple(float(word) for word in _text(element, attribute).split())
-    if len(values) != 3:
+    words = _text(element, attribute).split()
+    if len(words) != 3:
         raise ValueError(f"attribute {attribute!r} of a <{element.tag}> needs three numbers")
-    return values
+    return tuple(_number(word) for word in words)
+
+
+def _float(element: ElementTree.Element, attribute: str) -> float:
+    return _number(_text(element, attribute))
+
+
+def _number(text: str) -> float:
+    """A number, which has to be below `LARGEST_NUMBER`."""
+    value = float(text)
+    if not abs(value) < LARGEST_NUMBER:
+        raise ValueError(f"the number {shown(text)} is not finite, or too large")
+    return value

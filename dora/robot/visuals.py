@@ -14,13 +14,14 @@ from typing import Any, cast
 
 import numpy as np
 import trimesh
-import yaml
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from dora.errors import InputError
+from dora.files import make_folder, write_bytes
+from dora.reading import read_yaml
 
 Row = Mapping[str, Any]
 """One row of the table."""
@@ -53,13 +54,20 @@ def write_meshes(folder: Path) -> list[Path]:
     Raises:
         InputError: as `build_meshes`.
     """
-    scenes = build_meshes(yaml.safe_load((folder / "visuals.yaml").read_text()))
+    table = folder / "visuals.yaml"
+    content = read_yaml(table, "table of visual meshes")
+    try:
+        scenes = build_meshes(content)
+    except (TypeError, ValueError, LookupError, AttributeError, ArithmeticError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{table} has a value that makes no mesh ({error}): correct it.") from error
     target = folder / "meshes"
-    target.mkdir(exist_ok=True)
+    make_folder(target)
     paths = []
     for name, scene in scenes.items():
         path = target / f"{name}.glb"
-        path.write_bytes(cast(bytes, scene.export(file_type="glb", include_normals=True)))
+        write_bytes(path, cast(bytes, scene.export(file_type="glb", include_normals=True)))
         paths.append(path)
     return paths
 
@@ -185,8 +193,12 @@ def main() -> None:
     if len(sys.argv) < 2:
         raise SystemExit("usage: python -m dora.robot.visuals FOLDER [FOLDER ...]")
     for folder in sys.argv[1:]:
-        for path in write_meshes(Path(folder)):
-            print(path, path.stat().st_size)
+        try:
+            for path in write_meshes(Path(folder)):
+                print(path, path.stat().st_size)
+        except InputError as error:
+            print(error, file=sys.stderr)
+            raise SystemExit(2) from error
 
 
 if __name__ == "__main__":

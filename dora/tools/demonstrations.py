@@ -10,8 +10,12 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 from dora.errors import InputError
+from dora.files import make_folder
 from dora.tasks import check_task_id
 from dora.tasks.env.env import DoraEnv
+
+LAST_SEED = 2**32 - 1
+"""Largest seed that NumPy takes."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,9 @@ def record_demonstrations(
     check_task_id(env_id)
     if tries < 1 or num_envs < 1:
         raise InputError(f"demonstrations need at least one try in one environment, not {tries} in {num_envs}")
+    if not 0 <= seed <= LAST_SEED - tries - num_envs:
+        raise InputError(f"the seed of the first start is {seed}; the seeds of all have to be from 0 to {LAST_SEED}")
+    make_folder(Path(folder))
     options = {"obs_mode": "state", "reward_mode": "dense", "guidance": "none"} | options
     env = RecordEpisode(
         cast(BaseEnv, gym.make(env_id, num_envs=num_envs, sim_backend="physx_cpu_batch", **options)),

@@ -1,5 +1,6 @@
 """Environment steps per second: ours against ManiSkill's own way of using several cores, on the same task."""
 
+import difflib
 import multiprocessing
 import time
 from collections.abc import Callable
@@ -18,6 +19,8 @@ from dora.errors import InputError
 from dora.parallel import run_cases
 from dora.sim import BACKEND, StepProfile
 
+MOST: dict[str, float] = {"num_envs": 100_000, "workers": 512, "seconds": 86_400}
+"""Largest value of each number of a measurement."""
 REFERENCE_PROCESSES = (2, 4, 8)
 """Process counts that the reference may choose from."""
 _ACTIONS_DRAWN = 64
@@ -74,10 +77,13 @@ def measure(env_id: str, num_envs: int, workers: int, seconds: float) -> EnvRepo
         InputError: if a number is not positive or there is no such task.
     """
     for name, value in (("num_envs", num_envs), ("workers", workers), ("seconds", seconds)):
-        if value <= 0:
-            raise InputError(f"{name} is {value}: it must be positive.")
+        if not 0 < value <= MOST[name]:
+            option = name.replace("_", "-")
+            raise InputError(f"--{option} is {value}: it must be positive, and at most {MOST[name]}.")
     if env_id not in gym.registry:
-        raise InputError(f"There is no task {env_id!r}: see gymnasium.registry for the ids.")
+        near = difflib.get_close_matches(env_id, gym.registry, 1)
+        hint = f"did you mean {near[0]}?" if near else "see gymnasium.registry for the ids."
+        raise InputError(f"There is no task {env_id!r}: {hint}")
     together = multiprocessing.get_context("spawn").Barrier(workers)
     arguments = (env_id, num_envs, seconds, together)
     ours = run_cases(_Measurement, arguments, range(workers), workers, chunk=1)  # the barrier gives each process one

@@ -9,7 +9,14 @@ import torch
 from dora.errors import InputError
 from dora.sim.grasp_tests.test_scene import Physics
 from dora.tasks import find_task, make_task
+from dora.tasks.mdp.randomisation import find_preset
 
+MOST_RATE, MOST_ITERATIONS, MOST_OFFSET = 100_000.0, 255, 1.0
+"""Largest rate [Hz], number of position iterations [1] (PhysX's limit) and contact offset [m]."""
+WHAT = ("rate in Hz", "number of iterations", "contact offset in m")
+"""How messages call these."""
+MOST_STARTS = 100_000
+"""Largest number of starts [1]."""
 TUNNELLED = 0.010
 """Overlap that counts as tunnelling: about the radius of a finger or a handle [m]."""
 
@@ -43,8 +50,9 @@ def parse_physics(text: str) -> Physics:
         numbers = float(int(frequency)), int(iterations), float(offset) / 1000
     except ValueError:
         raise InputError(f"{text!r} is not FREQUENCY:OFFSET_MM:ITERATIONS, such as 240:10:8") from None
-    if min(numbers) <= 0:
-        raise InputError(f"{text!r} has a number that is not above zero")
+    for number, most, what in zip(numbers, (MOST_RATE, MOST_ITERATIONS, MOST_OFFSET), WHAT, strict=True):
+        if not 0 < number <= most:
+            raise InputError(f"{text!r} has the {what} {number:g}, which has to be above 0 and at most {most:g}")
     return Physics(rate=numbers[0], position_iterations=numbers[1], contact_offset=numbers[2])
 
 
@@ -69,8 +77,9 @@ def measure_physics(
     Raises:
         InputError: for an unknown id or preset, no start, or a rate that is no multiple of the control's.
     """
-    if starts < 1:
-        raise InputError(f"physics is compared on at least one start, not {starts}")
+    if not 1 <= starts <= MOST_STARTS:
+        raise InputError(f"--starts is {starts}; physics is compared on 1 to {MOST_STARTS} starts")
+    find_preset(preset)
     control = find_task(env_id).CONFIG().control_frequency
     for physics in settings:
         if physics.rate % control:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from functools import cache
 from pathlib import Path
 from typing import cast
@@ -15,7 +14,10 @@ from torch import Tensor
 from trimesh.visual import ColorVisuals
 
 from dora.affordance.objects.solids import shape_mesh
+from dora.containers import MOST_FACES, check_container
+from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion
+from dora.reading import read_xml
 from dora.robot import RobotDescription, SerialChain
 
 GAMMA = 2.2
@@ -101,7 +103,7 @@ def face_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "f 4"]:
 def _visual_files(robot: RobotDescription) -> dict[str, list[Path]]:
     """Files of the visual meshes of each link of the URDF; meshes are in the link frames."""
     files = {}
-    for link in ElementTree.parse(robot.urdf).getroot().findall("link"):
+    for link in read_xml(robot.urdf, "URDF").findall("link"):
         meshes = link.findall("visual/geometry/mesh")
         files[link.get("name")] = [robot.urdf.parent / mesh.get("filename", "") for mesh in meshes]
     return files
@@ -116,8 +118,17 @@ def _link_mesh(robot: RobotDescription, link: str, visuals: dict[str, list[Path]
 @cache
 def _coloured(path: Path) -> tuple[trimesh.Trimesh, ...]:
     """Geometries of a mesh file, each in the one colour that a screen shows."""
+    check_container(path)
+    try:
+        scene = trimesh.load_scene(path)
+        faces = sum(len(scene.geometry[scene.graph[node][1]].faces) for node in scene.graph.nodes_geometry)
+        pieces = cast(list[trimesh.Trimesh], scene.dump() if faces <= MOST_FACES else [])
+    except Exception as error:  # the readers of meshes raise whatever they meet
+        raise InputError(f"{path} cannot be read ({type(error).__name__}): export the mesh again.") from error
+    if faces > MOST_FACES:
+        raise InputError(f"{path} has {faces} faces; reduce it to at most {MOST_FACES}.")
     parts = []
-    for part in cast(list[trimesh.Trimesh], trimesh.load_scene(path).dump()):
+    for part in pieces:
         factor = getattr(getattr(part.visual, "material", None), "baseColorFactor", None)
         linear = np.full(4, 255) if factor is None else np.asarray(factor)
         shown = (linear[:3] / 255) ** (1 / GAMMA)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 from dora.affordance.maps.nearest_points import NearestTable, RegionField
 from dora.affordance.maps.poisson_disk import sample_evenly
 from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.containers import check_triangles
 from dora.errors import InputError
 from dora.files import read_tensors, write_tensors
 
@@ -21,6 +23,11 @@ COUNT = 4096
 """Default number of surface points of a map."""
 FORMAT = "dora-map 1"
 """Format and version of a file of a map."""
+STORED = {
+    "points": ("n", 3, False), "normals": ("n", 3, False), "areas": ("n", 0, False), "labels": ("n", 0, True),
+    "vertices": ("v", 3, False), "faces": ("f", 3, True), "face_labels": ("f", 0, True),
+}  # fmt: skip
+"""Tensors of a file: of what they have rows, numbers in a row, and whether they are whole."""
 CANDIDATES_PER_NEIGHBOUR, FEWEST_CANDIDATES = 6, 48
 """Points stored per cell of the nearest-point table: this many per neighbour asked for, and at least the second."""
 
@@ -175,8 +182,9 @@ class AffordanceMap:
             InputError: no such file, damaged, of another format, or of another object.
         """
         tensors, metadata = read_tensors(Path(path), FORMAT)
-        if obj is not None and metadata["digest"] != obj.digest:
+        if obj is not None and metadata.get("digest") != obj.digest:
             raise InputError(f"{path} is the map of another shape or labelling than {obj.name}: make it again.")
+        _check_stored(Path(path), tensors, metadata)
         vertices, faces, face_labels = (tensors[key].numpy() for key in ("vertices", "faces", "face_labels"))
         return cls(
             points=tensors["points"],
@@ -189,3 +197,24 @@ class AffordanceMap:
             face_labels=face_labels,
             digest=metadata["digest"],
         )
+
+
+def _check_stored(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
+    """Refuses what is no map: names, types, shapes and indices of its tensors and texts."""
+    names = metadata.get("names")
+    texts = [metadata.get("name"), metadata.get("digest"), *(names if isinstance(names, list) else [None])]
+    if set(tensors) != set(STORED) or not all(isinstance(text, str) for text in texts):
+        raise InputError(f"{path} lacks tensors or texts of a map: make it again.")
+    rows = {"n": len(tensors["points"]), "v": len(tensors["vertices"]), "f": len(tensors["faces"])}
+    for key, (count, width, whole) in STORED.items():
+        value = tensors[key]
+        if value.shape != ((rows[count], width) if width else (rows[count],)):
+            raise InputError(f"{path} has {key} of shape {tuple(value.shape)}: make it again.")
+        if value.dtype not in ((torch.int64, torch.int32, torch.uint8) if whole else (torch.float32, torch.float64)):
+            raise InputError(f"{path} has {key} of the type {value.dtype}: make it again.")
+        if not whole and not bool(torch.isfinite(value).all()):
+            raise InputError(f"{path} has {key} that are not finite: make it again.")
+    check_triangles(path, tensors["vertices"].numpy(), tensors["faces"].numpy())
+    labels = torch.cat([tensors["labels"], tensors["face_labels"]]).long()
+    if not rows["n"] or int(labels.min()) < 0 or int(labels.max()) >= len(texts) - 2:
+        raise InputError(f"{path} has no points, or labels without a name: make it again.")

@@ -7,14 +7,14 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from dora.affordance.maps.voting import HAND_PARTS
-from dora.errors import InputError
+from dora.errors import InputError, shown
 
 COUNT, POINT, PART = "contact_map/count", "contact_map/point", "contact_map/part"
 """Names of the tensors: (c,) touched points per row; (t,) their indices, rows one after the other; (t,) their parts."""
 KINDS = (torch.uint8, torch.int16, torch.int32, torch.int64)
 """Types of the tensors that are accepted."""
-MOST_POINTS = 2**20
-"""Largest number of points of a map."""
+MOST_POINTS, MOST_CELLS = 2**20, 2**28
+"""Largest number of points of a map, and of all maps of a file together."""
 
 
 def pack(maps: UInt8[Tensor, "c p"]) -> dict[str, Tensor]:
@@ -43,7 +43,9 @@ def unpack(tensors: dict[str, Tensor], rows: int, points: object, whose: str) ->
     fault = f"{whose} holds damaged contact maps"
     again = "use another file, or make it again."
     if not isinstance(points, int) or not 0 < points <= MOST_POINTS or any(each is None for each in found):
-        raise InputError(f"{fault} (incomplete, or of {points} points): {again}")
+        raise InputError(f"{fault} (incomplete, or of {shown(points)} points): {again}")
+    if rows * points > MOST_CELLS:
+        raise InputError(f"{fault} ({rows} of {points} points each, more than {MOST_CELLS} together): {again}")
     if any(each.ndim != 1 or each.dtype not in KINDS for each in found if each is not None):
         raise InputError(f"{fault} (a table that is not one column of integers): {again}")
     count, point, part = (each.long() for each in found if each is not None)

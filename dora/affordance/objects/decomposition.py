@@ -14,9 +14,10 @@ import trimesh
 from jaxtyping import Float
 
 from dora.affordance.objects.solids import hull_of
+from dora.containers import check_triangles
 from dora.digests import digest_of
 from dora.errors import InputError
-from dora.files import read_tensors, write_tensors
+from dora.files import read_tensors, stored_or_made, write_tensors
 
 THRESHOLD = 0.05
 """Default largest concavity of a hull relative to the mesh's size; see `decompose` [1]."""
@@ -52,8 +53,8 @@ class Deviation:
 
 
 def cache_folder() -> Path:
-    """Folder of cached files: $DORA_CACHE, else ~/.cache/dora."""
-    return Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "dora")
+    """Folder of cached files: $DORA_CACHE, else ~/.cache/dora. What cannot be stored there is made each time."""
+    return Path(os.environ.get(CACHE_VARIABLE) or Path("~/.cache/dora").expanduser())
 
 
 def decompose(
@@ -77,12 +78,7 @@ def decompose(
     if not mesh.is_watertight:
         raise InputError("only a closed surface can be decomposed: fill the holes of the mesh first.")
     path = (Path(cache_dir) if cache_dir else cache_folder()) / "hulls" / f"{_digest(mesh, threshold)}.safetensors"
-    if path.is_file():
-        return _load(path)
-    hulls = _run(mesh, threshold)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _save(path, hulls)
-    return hulls
+    return stored_or_made(path, _load, lambda: _run(mesh, threshold), _save)
 
 
 def deviation(mesh: trimesh.Trimesh, hulls: Sequence[trimesh.Trimesh], seed: int = 0) -> Deviation:
@@ -146,7 +142,12 @@ def _save(path: Path, hulls: Sequence[trimesh.Trimesh]) -> None:
 
 def _load(path: Path) -> list[trimesh.Trimesh]:
     tensors, metadata = read_tensors(path, FORMAT)
-    return [
-        trimesh.Trimesh(tensors[f"{i}/vertices"].numpy(), tensors[f"{i}/faces"].numpy(), process=False)
-        for i in range(metadata["count"])
-    ]
+    names = [f"{i}/{part}" for i in range(len(tensors) // 2) for part in ("vertices", "faces")]
+    if metadata.get("count") != len(tensors) / 2 or not tensors or set(names) != set(tensors):
+        raise InputError(f"{path} holds no hulls: delete it.")
+    hulls = []
+    for vertices, faces in zip(names[::2], names[1::2], strict=True):
+        corners, triangles = tensors[vertices].numpy(), tensors[faces].numpy()
+        check_triangles(path, corners, triangles)
+        hulls.append(trimesh.Trimesh(corners, triangles, process=False))
+    return hulls

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from pathlib import Path
 from typing import Any, get_args
 
@@ -24,16 +23,18 @@ from dora.affordance.objects.affordance_object import (
 )
 from dora.affordance.objects.importing import LARGEST, SMALLEST
 from dora.affordance.objects.mesh_files import LABEL, read_ply
-from dora.errors import InputError
-from dora.files import decoded
+from dora.errors import InputError, shown
+from dora.reading import read_toml
 from dora.robot.shapes import Shape
 
 OBJECT_FILE = "object.toml"
 """Name of the file of an object's folder that says what the object is."""
 FORMAT = "dora-object 1"
 """Format and version of an object's folder."""
-MOST_BYTES = 1_000_000
-"""Size of an object.toml above which it is not read [bytes]."""
+MOST_PIECES, LONGEST_TEXT = 1000, 200
+"""Largest number of tables in a list, and of characters in a text [1]."""
+LARGEST_NUMBER = 1e9
+"""Every number of the file is smaller, in SI units."""
 FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*\.ply")
 """Names of mesh files: plain, so that they lie in the folder itself."""
 SIZES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}
@@ -80,21 +81,16 @@ class _Reader:
         """The tables of the file, with known keys alone."""
         if not self.path.is_file():
             raise InputError(f"{self.folder} has no {OBJECT_FILE}; give the folder of an object.")
-        if self.path.stat().st_size > MOST_BYTES:
-            raise self.fail(f"the file has more than {MOST_BYTES} bytes; keep meshes in files of their own.")
-        try:
-            content = tomllib.loads(decoded(self.path.read_bytes()))
-        except (ValueError, RecursionError) as error:
-            raise self.fail(f"the file is not valid TOML ({error}); correct it.") from error
+        content = read_toml(self.path, "file about an object")
         for key in RESERVED:
             if key in content:
                 raise self.fail(f"{key!r} is reserved for articulated objects, which cannot be loaded yet; remove it.")
         self.keys(content, "object", "the file")
         if content["format"] != FORMAT:
-            raise self.fail(f"the format is {content['format']!r}, not {FORMAT!r}; write the folder again.")
+            raise self.fail(f"the format is {shown(content['format'])}, not {FORMAT!r}; write the folder again.")
         if content["name"] != self.folder.name:
             raise self.fail(
-                f"the name is {content['name']!r}, and the folder is {self.folder.name!r}; make them equal."
+                f"the name is {shown(content['name'])}, and the folder is {self.folder.name!r}; make them equal."
             )
         return content
 
@@ -131,24 +127,24 @@ class _Reader:
         required, optional = KEYS[kind]
         for key in table:
             if key not in required + optional:
-                raise self.fail(f"{where} has the unknown key {key!r}; known: {', '.join(required + optional)}.")
+                raise self.fail(f"{where} has the unknown key {shown(key)}; known: {', '.join(required + optional)}.")
         for key in required:
             if key not in table:
                 raise self.fail(f"{where} lacks the key {key!r}; add it.")
 
     def text(self, value: Any, where: str) -> str:
-        if not isinstance(value, str) or not value:
-            raise self.fail(f"{where} must be a text that is not empty.")
+        if not isinstance(value, str) or not 0 < len(value) <= LONGEST_TEXT:
+            raise self.fail(f"{where} must be a text that is not empty, of at most {LONGEST_TEXT} characters.")
         return value
 
     def one_of(self, value: Any, known: tuple[str, ...], where: str) -> Any:
         if value not in known:
-            raise self.fail(f"{where} is {value!r}; choose one of: {', '.join(known)}.")
+            raise self.fail(f"{where} is {shown(value)}; choose one of: {', '.join(known)}.")
         return value
 
     def rows(self, value: Any, where: str) -> list[Any]:
-        if not isinstance(value, list) or not value:
-            raise self.fail(f"[[{where}]] must have at least one table.")
+        if not isinstance(value, list) or not 0 < len(value) <= MOST_PIECES:
+            raise self.fail(f"[[{where}]] must have at least one table, and at most {MOST_PIECES}.")
         return value
 
     def numbers(self, value: Any, length: int, where: str) -> tuple[float, ...]:
@@ -157,8 +153,8 @@ class _Reader:
             raise self.fail(f"{where} must be a list of {length} numbers.")
         if not all(isinstance(each, int | float) and not isinstance(each, bool) for each in value):
             raise self.fail(f"{where} must be numbers.")
-        if not all(abs(each) < math.inf for each in value) or any(isinstance(x, int) and abs(x) > 1e300 for x in value):
-            raise self.fail(f"{where} must be finite numbers.")
+        if not all(abs(each) < LARGEST_NUMBER for each in value):
+            raise self.fail(f"{where} must be finite numbers below {LARGEST_NUMBER:g}.")
         return tuple(float(each) for each in value)
 
     def positive(self, value: Any, where: str) -> float:
@@ -193,7 +189,7 @@ class _Reader:
         for row in self.rows(value, "regions"):
             self.keys(row, "region", "a region")
             names.append(self.text(row["name"], "the name of a region"))
-            classes.append(self.text(row["grasp_class"], f"grasp_class of {row['name']!r}"))
+            classes.append(self.text(row["grasp_class"], f"grasp_class of {shown(row['name'])}"))
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
             raise self.fail(f"two regions are named {twice!r}; rename one of them.")
@@ -202,7 +198,7 @@ class _Reader:
     def mesh(self, name: Any) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"] | None]:
         """A mesh of the folder and the labels of its faces, if it has any."""
         if not isinstance(name, str) or not FILE_NAME.fullmatch(name):
-            raise self.fail(f"{name!r} is no name of a mesh; name a .ply file in the folder itself.")
+            raise self.fail(f"{shown(name)} is no name of a mesh; name a .ply file in the folder itself.")
         mesh, labels = read_ply(self.folder / name)
         if np.abs(mesh.vertices).max() > LARGEST:
             raise InputError(f"{self.folder / name} reaches farther than {LARGEST} m from its origin: use metres.")

@@ -19,19 +19,24 @@ from dora.affordance.objects.decomposition import THRESHOLD, decompose
 from dora.affordance.objects.labels import WHOLE, FaceLabels, grasp_classes, read_labels, without_number
 from dora.affordance.objects.surface_repair import repair
 from dora.affordance.objects.surfaces.weighing import Weighing, check_weight, weigh
-from dora.errors import InputError
-from dora.files import decoded
+from dora.containers import MOST_BYTES, MOST_FACES, check_container
+from dora.errors import InputError, shown
+from dora.reading import decoded, read_bytes
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Factor from each unit of length to metres [m]."""
 SMALLEST, LARGEST = 0.005, 2.0
 """Range of the longest side of an object, outside of which its unit is most likely wrong [m]."""
-MOST_FACES = 200_000
-"""Largest number of faces of a mesh."""
 USUAL = (0.01, 0.6)
 """Range of the longest side outside of which a size is remarked on [m]."""
+KINDS = (".3mf", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+"""Endings of the mesh files that are read."""
 STABLE = 0.002
 """Smallest distance of the centre of mass from the outline of the foot at which an object stands as modelled [m]."""
+
+
+class TooLarge(InputError):
+    """A mesh of more than `MOST_FACES` faces."""
 
 
 def import_object(
@@ -47,7 +52,7 @@ def import_object(
     """An object from a file. Axes are kept, the origin moves to the centre of mass.
 
     Args:
-        path: file in OBJ, STL, PLY, GLB, OFF or another format of trimesh. Several bodies are united.
+        path: file of one of `KINDS`. Several bodies are united.
         labels: file of labels, see `dora.affordance.objects.labels.read_labels`; if None, the regions are the named
             bodies of the file, else its materials, else the whole mesh.
         scale: factor of all lengths [1].
@@ -155,19 +160,18 @@ def read_mesh(path: Path, keep_order: bool = False) -> tuple[trimesh.Trimesh, li
     Raises:
         InputError: it cannot be read, holds no triangles, too many, or coordinates that are not finite.
     """
-    if not path.is_file():
-        raise InputError(f"there is no mesh file {path}.")
+    if path.suffix.lower() not in KINDS:
+        raise InputError(f"{path} cannot be read as a mesh: give a file ending in {', '.join(KINDS)}.")
+    check_container(path)
     if path.suffix.lower() != ".obj":
-        parts = _parts(_load(path, {}))
+        parts = _load(path, {})
     elif keep_order:
-        parts = _parts(_load(path, {"maintain_order": True, "skip_materials": True}))
+        parts = _load(path, {"maintain_order": True, "skip_materials": True})
     else:
         parts = _obj_parts(path)
     if not parts:
         raise InputError(f"{path} holds no triangles: export the surface of the object as a triangle mesh.")
     mesh = cast(trimesh.Trimesh, trimesh.util.concatenate([part for _, part in parts]))
-    if len(mesh.faces) > MOST_FACES:
-        raise InputError(f"{path} has {len(mesh.faces)} faces; reduce it to at most {MOST_FACES} in a mesh editor.")
     if not np.isfinite(mesh.vertices).all():
         raise InputError(f"{path} has coordinates that are not finite; export it again.")
     return mesh, [name for name, part in parts for _ in range(len(part.faces))]
@@ -176,17 +180,21 @@ def read_mesh(path: Path, keep_order: bool = False) -> tuple[trimesh.Trimesh, li
 def _obj_parts(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
     """Triangle meshes of an OBJ file, named by objects if there are several, else by groups, else by materials."""
     for split in ({"split_objects": True, "group_material": False}, {"split_groups": True, "group_material": False}):
-        parts = _parts(_load(path, split))
+        parts = _load(path, split)
         if len({name for name, _ in parts}) > 1:
             return parts
-    return _parts(_load(path, {}))
+    return _load(path, {})
 
 
-class _Files(FilePathResolver):
-    """Files beside a mesh, such as its materials, without byte order marks."""
+class _Neighbours(FilePathResolver):
+    """Files that a mesh file names, without byte order marks: plain ones of bounded size, in its folder or below."""
 
     def get(self, name: str) -> bytes:
-        return _without_mark(super().get(name))
+        folder = Path(str(self.parent)).resolve()
+        path = (folder / name.strip()).resolve()
+        if not path.is_relative_to(folder):
+            raise InputError(f"it names the file {shown(name)}, which does not lie beside it")
+        return _without_mark(read_bytes(path, "file that a mesh names", MOST_BYTES))
 
 
 def _without_mark(content: bytes) -> bytes:
@@ -195,29 +203,39 @@ def _without_mark(content: bytes) -> bytes:
     return decoded(content).encode() if marked else content
 
 
-def _load(path: Path, options: dict[str, Any]) -> trimesh.Scene:
-    """The scene that trimesh reads from a file; `options` are those of its format."""
+def _load(path: Path, options: dict[str, Any]) -> list[tuple[str, trimesh.Trimesh]]:
+    """The parts of the scene that trimesh reads from a file; `options` are those of its format."""
     try:
-        content = io.BytesIO(_without_mark(path.read_bytes()))
-        kind = path.suffix.lower().removeprefix(".")
-        return trimesh.load_scene(content, file_type=kind, resolver=_Files(str(path)), process=False, **options)
+        content = io.BytesIO(_without_mark(read_bytes(path, "mesh file", MOST_BYTES)))
+        kind, files = path.suffix.lower().removeprefix("."), _Neighbours(str(path))
+        return _parts(trimesh.load_scene(content, file_type=kind, resolver=files, process=False, **options), path)
+    except TooLarge:
+        raise
     except Exception as error:  # the readers of some twenty formats raise whatever they meet
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path} cannot be read ({reason}): export it as OBJ, STL, PLY or GLB.") from error
 
 
-def _parts(scene: trimesh.Scene) -> list[tuple[str, trimesh.Trimesh]]:
+def _parts(scene: trimesh.Scene, path: Path) -> list[tuple[str, trimesh.Trimesh]]:
     """Triangle meshes of a scene in its frame, named by body if these names differ, else by material.
 
     Names that differ in the number of a copy only are one name.
     """
     placed, order = [], {name: i for i, name in enumerate(scene.geometry)}
-    for node in sorted(scene.graph.nodes_geometry, key=lambda node: (order[scene.graph[node][1]], node)):
-        pose, name = scene.graph[node]
+    nodes = [(scene.graph[node], node) for node in scene.graph.nodes_geometry]
+    count = sum(len(getattr(scene.geometry[name], "faces", ())) for (_, name), _ in nodes)
+    if count > MOST_FACES:
+        raise TooLarge(f"{path} has {count} faces; reduce it to at most {MOST_FACES} in a mesh editor.")
+    for (pose, name), _ in sorted(nodes, key=lambda each: (order[each[0][1]], each[1])):
         part = scene.geometry[name]
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
             material = getattr(getattr(part.visual, "material", None), "name", None)
-            placed.append((name, material or name, part.copy().apply_transform(pose)))
+            if np.shape(part.vertices)[1:] != (3,) or np.shape(part.faces)[1:] != (3,):
+                raise InputError("it has points or faces that are not three numbers")
+            if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
+                raise InputError("it has faces that name vertices which do not exist")
+            bare = trimesh.Trimesh(part.vertices, part.faces, process=False)
+            placed.append((name, str(material or name), bare.apply_transform(pose)))
     for names in ([without_number(name) for name, _, _ in placed], [without_number(each) for _, each, _ in placed]):
         if len(set(names)) > 1:
             return [(name, part) for name, (_, _, part) in zip(names, placed, strict=True)]

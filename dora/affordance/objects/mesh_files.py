@@ -13,13 +13,11 @@ import trimesh
 from jaxtyping import Int
 from trimesh.exchange.ply import load_ply
 
-from dora.affordance.objects.importing import MOST_FACES
 from dora.affordance.objects.palette import PALETTE, colours
+from dora.containers import MOST_BYTES, check_lines, check_triangles
 from dora.errors import InputError
 from dora.files import write_bytes
 
-MOST_BYTES = 64_000_000
-"""Size of a mesh file above which it is not read [bytes]."""
 LABEL = "label"
 """Property of a PLY face: the index of its region."""
 LABELLED = [("vertices", "<i4", 3), ("red", "u1"), ("green", "u1"), ("blue", "u1"), (LABEL, "<i4")]
@@ -70,6 +68,7 @@ def read_ply(path: Path) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"] | None]
         raise InputError(f"there is no mesh file {path}; put it there or correct its name.")
     if path.stat().st_size > MOST_BYTES:
         raise InputError(f"{path} has {path.stat().st_size} bytes; reduce the mesh to at most {MOST_BYTES}.")
+    check_lines(path)
     try:
         with path.open("rb") as stream:
             content = load_ply(stream, fix_texture=False, skip_materials=True)
@@ -78,7 +77,9 @@ def read_ply(path: Path) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"] | None]
     except Exception as error:  # the reader raises whatever it meets in a damaged file
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path} is no intact PLY file ({reason}): write it again.") from error
-    _check(path, vertices, faces, labels)
+    check_triangles(path, vertices, faces)
+    if labels is not None and (labels.shape != (len(faces),) or not np.issubdtype(labels.dtype, np.integer)):
+        raise InputError(f"{path} must give every face one whole number as its {LABEL!r}.")
     mesh = trimesh.Trimesh(vertices, faces.astype(np.int64), process=False)
     return mesh, None if labels is None else labels.astype(np.int64)
 
@@ -87,17 +88,3 @@ def _labels(faces: Any) -> np.ndarray | None:
     """The labels among the properties of all faces: columns of an array (binary files) or of a mapping (text)."""
     names = faces if isinstance(faces, dict) else faces.dtype.names or ()
     return np.array(faces[LABEL]).reshape(-1) if LABEL in names else None
-
-
-def _check(path: Path, vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray | None) -> None:
-    """Refuse what is no list of triangles between finite vertices with one label each."""
-    if vertices.shape != (len(vertices), 3) or not np.isfinite(vertices).all():
-        raise InputError(f"{path} has vertices that are not three finite numbers: write it again.")
-    if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer) or not len(faces):
-        raise InputError(f"{path} must hold triangles and nothing else: triangulate the mesh.")
-    if len(faces) > MOST_FACES:
-        raise InputError(f"{path} has {len(faces)} faces; reduce it to at most {MOST_FACES} in a mesh editor.")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(f"{path} has faces that name vertices which do not exist: write it again.")
-    if labels is not None and (labels.shape != (len(faces),) or not np.issubdtype(labels.dtype, np.integer)):
-        raise InputError(f"{path} must give every face one whole number as its {LABEL!r}.")

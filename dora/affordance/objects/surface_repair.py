@@ -23,6 +23,8 @@ SCRAP = 0.05
 """Share of the area up to which a component that cannot be closed, or is flat, is dropped [1]."""
 MOST_SCRAPS = 0.2
 """Share of the area above which scraps together are no scraps any more [1]."""
+MOST_BODIES = 1000
+"""Largest number of connected parts; each takes a few milliseconds [1]."""
 LEAST_VOLUME = 1e-4
 """Smallest ratio of volume to area^1.5 [1]; a ball has 0.094, a sheet 0."""
 FLAT = 0.015
@@ -114,6 +116,11 @@ def _bodies(mesh: trimesh.Trimesh, labels: np.ndarray, name: str) -> tuple[list[
     """The connected parts of a surface, closed, and the areas of those that are scraps."""
     bodies, scraps = [], []
     groups = trimesh.graph.connected_components(adjacency(mesh), nodes=np.arange(len(mesh.faces)), min_len=1)
+    if len(groups) > MOST_BODIES:
+        raise InputError(
+            f"{name} falls into {len(groups)} parts that do not hang together, and may have {MOST_BODIES}: "
+            "export closed surfaces, or drop loose faces in a mesh editor."
+        )
     for group in groups:
         area = float(mesh.area_faces[group].sum())
         small = area <= SCRAP * mesh.area

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.objects.decomposition import cache_folder
-from dora.affordance.reach.approach_paths import OK
+from dora.affordance.reach.approach_paths import OK, REASONS
 from dora.affordance.reach.feasibility import Reach
 from dora.digests import digest_of
 from dora.errors import InputError
-from dora.files import read_tensors, write_tensors
+from dora.files import read_tensors, stored_or_made, write_tensors
 from dora.geometry.rotations import quaternion_apply, quaternion_inverse, quaternion_multiply
 from dora.robot.motion import inverse_kinematics
 
@@ -144,20 +144,26 @@ class ReachTable:
         digest = table_digest(reach, candidates, grid, height, rest)
         path = (cache or cache_folder()) / file_name(digest)
         bundled = [] if reach.folder is None else [reach.folder / file_name(digest)]
-        for known in (*bundled, path):
+
+        def load(known: Path) -> ReachTable:
+            table = cls.load(known, digest, grid, height, rest)
+            if table.reason.shape[1] != len(candidates):
+                raise InputError(f"{known} holds a table of another number of candidates; delete it.")
+            return table
+
+        def make() -> ReachTable:
+            nodes, count, found = grid.nodes(), max(1, CHUNK // len(candidates)), []
+            for part in nodes.split(count):
+                position, quaternion = poses(part, height, rest)
+                found.append(reach.filter(candidates, position, quaternion).reason)
+                if progress is not None:
+                    progress(sum(map(len, found)), len(nodes))
+            return cls(grid, rest, height, torch.cat(found).to(torch.uint8), digest)
+
+        for known in bundled:
             if known.is_file():
-                return cls.load(known, digest, grid, height, rest)
-        nodes, count = grid.nodes(), max(1, CHUNK // len(candidates))
-        found = []
-        for part in nodes.split(count):
-            position, quaternion = poses(part, height, rest)
-            found.append(reach.filter(candidates, position, quaternion).reason)
-            if progress is not None:
-                progress(sum(map(len, found)), len(nodes))
-        table = cls(grid, rest, height, torch.cat(found).to(torch.uint8), digest)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        table.save(path)
-        return table
+                return load(known)
+        return stored_or_made(path, load, make, lambda path, table: table.save(path))
 
     def mask(self, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]) -> Bool[Tensor, "b c"]:
         """Mask (b, c) of feasible candidates for objects at world poses ([m], wxyz).
@@ -197,9 +203,14 @@ class ReachTable:
             InputError: no such file, damaged, or its digest differs from `digest`.
         """
         tensors, metadata = read_tensors(Path(path), FORMAT)
-        if metadata["digest"] != digest:
+        if metadata.get("digest") != digest:
             raise InputError(f"{path} was made for other candidates or another robot, object or grid; delete it.")
-        return cls(grid, rest, height, tensors["reason"], digest)
+        reason, nodes = tensors.get("reason"), math.prod(grid.shape)
+        if set(tensors) != {"reason"} or reason is None or reason.dtype != torch.uint8 or reason.ndim != 2:
+            raise InputError(f"{path} holds no table of reasons; delete it.")
+        if len(reason) != nodes or not reason.numel() or int(reason.max()) >= len(REASONS):
+            raise InputError(f"{path} holds a table of other places than {nodes}, or unknown reasons; delete it.")
+        return cls(grid, rest, height, reason, digest)
 
     def to(self, device: torch.device | str) -> ReachTable:
         """The same table on another device."""

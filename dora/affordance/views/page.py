@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import importlib
-import re
+import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -23,10 +23,13 @@ from dora.affordance.objects.palette import PALETTE, colours
 from dora.affordance.search.cache import hand_of
 from dora.affordance.views.pictures import PARTS
 from dora.affordance.views.surface import Surface, unshared
-from dora.errors import InputError
+from dora.errors import InputError, shown
 from dora.geometry.rotations import quaternion_from_matrix
 from dora.robot import RobotDescription
+from dora.tables import markdown_text
 
+LAST_PORT = 65_535
+"""Largest number of a TCP port."""
 MOST_HANDS = 16
 """Largest number of hands that a page shows at once."""
 CONTACT_SIZE = 0.004
@@ -75,14 +78,14 @@ def describe(candidates: GraspCandidates, row: int) -> str:
     touching = sorted({int(f) for f in candidates.contact_finger[row] if f > 0})
     score = float(candidates.score[row])
     lines = [
-        f"**{plain(candidates.grasp_class[row])}** (candidate {row})",
+        f"**{markdown_text(candidates.grasp_class[row])}** (candidate {row})",
         f"- {'valid' if candidates.valid[row] else 'not valid'}",
         f"- succeeded in {100 * score:.0f} % of its executions" if np.isfinite(score) else "- not ranked",
         f"- {1000 * float(candidates.penetration[row]):.2f} mm into the object",
         f"- {1000 * float(candidates.self_penetration[row]):.2f} mm into itself",
         f"- contacts: {', '.join(names[f] for f in touching) or 'none'}",
         f"- contact map: {', '.join(f'{n} {k}' for n, k in zip(names[1:], points[1:], strict=True) if k) or 'none'}",
-        *(f"- {name}: {float(value[row]):.3g}" for name, value in candidates.energy.items()),
+        *(f"- {markdown_text(name)}: {float(value[row]):.3g}" for name, value in candidates.energy.items()),
     ]
     return "\n".join(lines)
 
@@ -133,11 +136,6 @@ def _filled(values: list[Float[Tensor, "c d"]], rest: tuple[float, ...]) -> Floa
     for link, value in enumerate(values):
         table[link, : len(value)] = value.numpy()
     return table.reshape(-1, len(rest))
-
-
-def plain(name: str) -> str:
-    """A name as Markdown that shows it as it is."""
-    return re.sub(r"([\\`*_{}\[\]<>#|~$&])", r"\\\1", name)
 
 
 def legend_html(title: str, table: Mapping[str, tuple[int, int, int]]) -> str:
@@ -254,7 +252,7 @@ class GraspPage:
             row = rows[first]
             label = "nothing" if self.voted[row] == NO_CONTACT else self.obj.labels[self.voted[row]]
             words = f"grasp {first + 1} of {len(rows)}\n\n{describe(self.candidates, row)}"
-            self.text.content = f"{words}\n- the map votes for {plain(label)}"
+            self.text.content = f"{words}\n- the map votes for {markdown_text(label)}"
         self.hands.show(self.candidates.select(shown) if shown else None)
         if rows and self.colouring.value == CONTACTS:
             self._paint(self.surface.contacts(self.candidates.contact_map[rows[first]]))
@@ -283,8 +281,14 @@ def start_server(host: str, port: int, label: str) -> Any:
     """Start viser's server on exactly this port.
 
     Raises:
-        InputError: viser is not installed, or the port is in use.
+        InputError: viser is not installed, the port is in use or none, or there is no such address.
     """
+    if not 1 <= port <= LAST_PORT:
+        raise InputError(f"--port is {port} and has to be from 1 to {LAST_PORT}.")
+    try:
+        socket.getaddrinfo(host, port)
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"--host is {shown(host)}, which is no address of this machine ({error}).") from error
     try:
         viser = importlib.import_module("viser")
     except ImportError as error:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend as DrawnLegend
 from matplotlib.patches import Patch
 
 from dora.files import write_bytes
@@ -58,21 +59,29 @@ def write_sheet(
         axis.set_axis_off()
     for axis, panel in zip(axes, panels, strict=False):
         axis.imshow(panel.view)
-        axis.set_title(panel.title, fontsize=SIZE)
+        axis.set_title(panel.title, fontsize=SIZE, parse_math=False)
         if panel.legend:
-            axis.legend(
+            _plain(axis.legend(
                 handles=_patches(panel.legend), loc="upper center", bbox_to_anchor=(0.5, 0.0),
                 ncols=len(panel.legend), fontsize=SIZE, frameon=False,
-            )  # fmt: skip
+            ))  # fmt: skip
     if legend:
         handles = _patches(legend)
-        figure.legend(
+        _plain(figure.legend(
             handles=handles, loc="outside lower center", ncols=len(handles), fontsize=SIZE, frameon=False, title=name
-        )
+        ))  # fmt: skip
     content = io.BytesIO()
     figure.savefig(content, format="png")
     write_bytes(Path(path), content.getvalue())
 
 
 def _patches(legend: Legend) -> list[Patch]:
-    return [Patch(color=np.divide(colour, 255).tolist(), label=label) for label, colour in legend.items()]
+    """A patch for each colour; matplotlib leaves out names that begin with "_", so these get a space."""
+    names = {label: f" {label}" if label.startswith("_") else label for label in legend}
+    return [Patch(color=np.divide(colour, 255).tolist(), label=names[label]) for label, colour in legend.items()]
+
+
+def _plain(legend: DrawnLegend) -> None:
+    """Shows names as they are, without mathematics between signs of dollar."""
+    for text in (*legend.get_texts(), legend.get_title()):
+        text.set_parse_math(False)

@@ -3,15 +3,15 @@
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 
 from dora.errors import InputError
-from dora.files import write_bytes
+from dora.files import read_safetensors, write_safetensors
 
+FORMAT = "dora-replay 1"
+"""Format and version of a file of transitions."""
 SHARD = 16_384
 """Largest number of transitions per file."""
 
@@ -44,8 +44,12 @@ class Replay:
         """A batch of transitions drawn uniformly."""
         return self.buffer.sample()  # pyright: ignore[reportReturnType]
 
-    def save(self, folder: Path) -> None:
+    def save(self, folder: Path, run: str = "") -> None:
         """Write the shards that are not on disk yet.
+
+        Args:
+            folder: of the files.
+            run: digest of the settings of the run, which the files hold.
 
         Raises:
             InputError: if the disk is full.
@@ -56,7 +60,7 @@ class Replay:
             if not path.exists():
                 rows = torch.arange(first, end) % self.capacity
                 data = self.buffer.storage[rows].flatten_keys("/").to_dict()
-                write_bytes(path, save({key: value.contiguous() for key, value in data.items()}))
+                write_safetensors(path, data, _header(first, end, run))
 
     def forget_old_files(self, folder: Path) -> None:
         """Remove shards that the present state does not need."""
@@ -65,19 +69,23 @@ class Replay:
             if path.name not in needed:
                 path.unlink()
 
-    def load(self, folder: Path) -> None:
+    def load(self, folder: Path, run: str = "") -> None:
         """Fill the buffer from the shards of the state `added`.
 
         Raises:
-            InputError: if a shard is missing or damaged.
+            InputError: if a shard is missing, damaged, or of another run or another place in it.
         """
+        columns: dict[str, tuple[torch.dtype, torch.Size]] = {}
         for name, first, end in self._shards():
+            required = {key: (value,) for key, value in _header(first, end, run).items()}
             try:
-                data = load_file(folder / name)
-            except (OSError, SafetensorError) as error:
-                raise InputError(
-                    f"The replay buffer {folder / name} is missing or damaged: the run cannot be resumed."
-                ) from error
+                data, _ = read_safetensors(folder / name, "replay file", required)
+            except InputError as error:
+                raise InputError(f"The replay buffer cannot be read, and so the run not be resumed: {error}") from error
+            found = {key: (value.dtype, value.shape[1:]) for key, value in data.items()}
+            columns = columns or found
+            if found != columns or any(value.shape[:1] != (end - first,) for value in data.values()) or not data:
+                raise InputError(f"The replay file {folder / name} does not fit the others: the run cannot be resumed.")
             shard = TensorDict(data, batch_size=[end - first]).unflatten_keys("/")
             slots = torch.arange(first, end) % self.capacity
             self.buffer.storage.set(slots, shard)  # pyright: ignore[reportArgumentType]
@@ -92,3 +100,8 @@ class Replay:
             shards.append((f"{first:010d}-{end:010d}.safetensors", first, end))
             first = end
         return shards
+
+
+def _header(first: int, end: int, run: str) -> dict[str, str]:
+    """Header of the file of the transitions from `first` to before `end` of a run."""
+    return {"format": FORMAT, "transitions": f"{first}-{end}", "run": run}

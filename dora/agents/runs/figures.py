@@ -1,5 +1,6 @@
 """Figures of a report: greedy evaluations during training, and smoothed curves of the training itself."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dora.agents.runs.run_results import Group, Run, grouped, zero_shares
+from dora.files import write_bytes
 
 COLOURS = {
     ("PPO", "affordance"): "#c0392b",
@@ -23,6 +25,8 @@ EPOCHS = 10_000
 """Epochs of the paper's trainings [1]: one of its epochs is this share of a budget."""
 SIGMA = 200
 """Standard deviation of the Gaussian with which the paper smooths its curves, in its epochs [1]."""
+LONGEST = 60
+"""Largest number of characters of a name in a figure [1]."""
 GRID = 200
 """Points of a smoothed curve [1]."""
 TRAINING = (
@@ -47,11 +51,14 @@ def smoothed(
         weights: of the values, such as the episodes over which each is a mean.
         sigma: standard deviation of the Gaussian [environment steps].
     """
-    known = np.isfinite(values) & (weights > 0)
-    kernel = np.exp(-0.5 * ((at[:, None] - steps[known]) / sigma) ** 2) * weights[known]
-    total = kernel.sum(1)
-    with np.errstate(invalid="ignore"):
-        return np.where(total > 1e-12, kernel @ values[known] / total, np.nan)
+    known = np.isfinite(steps) & np.isfinite(values) & (weights > 0)
+    steps, values, weights = steps[known], values[known], weights[known]
+    found = np.full(len(at), np.nan)
+    for k, place in enumerate(at):  # one after the other, so that the memory does not grow with both
+        kernel = np.exp(-0.5 * ((place - steps) / sigma) ** 2) * weights
+        if (total := kernel.sum()) > 1e-12:
+            found[k] = kernel @ values / total
+    return found
 
 
 def draw_curves(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
@@ -71,12 +78,22 @@ def draw_curves(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
     colours = _draw_evaluations(axes[0], evaluated)
     if trained:
         _draw_training(axes[1], trained, colours)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=2)
+    legend = figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=2)
+    for text in legend.get_texts():
+        text.set_parse_math(False)
     about = "greedy evaluation during training (mean and range over seeds; dotted: no correction)"
     below = f"\nbelow: training, smoothed over {SIGMA / EPOCHS:.0%} of the budget" if trained else ""
-    figure.suptitle(f"{env}, preset {preset}: {about}{below}")
-    figure.savefig(path, dpi=110)
+    figure.suptitle(f"{shortened(env)}, preset {shortened(preset)}: {about}{below}").set_parse_math(False)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=110)
     pyplot.close(figure)
+    write_bytes(path, content.getvalue())
+
+
+def shortened(name: str) -> str:
+    """A name as a figure shows it: characters that can be printed, and not too many."""
+    text = "".join(c if c.isprintable() else "?" for c in name)
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 def _draw_evaluations(axes: Any, groups: dict[Group, list[Run]]) -> dict[Group, Any]:
@@ -89,7 +106,7 @@ def _draw_evaluations(axes: Any, groups: dict[Group, list[Run]]) -> dict[Group, 
             length = min(len(m.curve) for m in members)
             values = [[m.curve[i][y] for m in members] for i in range(length)]
             at = [mean(m.curve[i][x] for m in members) / unit for i in range(length)]
-            label = f"{group[2]}, guidance {group[3]}, {group[4]}k ({len(members)})"
+            label = f"{shortened(group[2])}, guidance {shortened(group[3])}, {group[4]}k ({len(members)})"
             colour = colours.get(group, COLOURS.get(group[2:4]))
             (line,) = axis.plot(at, [mean(v) for v in values], color=colour, marker="o", markersize=3, label=label)
             colour = colours[group] = line.get_color()
@@ -110,10 +127,10 @@ def _draw_training(axes: Any, groups: dict[Group, list[Run]], colours: dict[Grou
     for axis, (column, label) in zip(axes, TRAINING, strict=True):
         for group, members in groups.items():
             colour, curves = colours.get(group, COLOURS.get(group[2:4])), []
-            at = np.linspace(0, min(m.progress["env_steps"].max(initial=0.0) for m in members), GRID)
+            at = np.linspace(0, min(np.nanmax(m.progress["env_steps"], initial=0.0) for m in members), GRID)
             for m in members:
                 steps, values, episodes = (m.progress[name] for name in ("env_steps", column, "episodes"))
-                curves.append(smoothed(at, steps, values, episodes, m.budget * SIGMA / EPOCHS))
+                curves.append(smoothed(at, steps, values, episodes, max(m.budget, 1) * SIGMA / EPOCHS))
                 known = np.isfinite(values)
                 (line,) = axis.plot(steps[known] / 1e3, values[known], color=colour, alpha=0.15, linewidth=0.6)
                 colour = colours[group] = line.get_color()

@@ -8,26 +8,39 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from dora.agents.runs.stored_results import LARGEST, MOST_COLUMNS, MOST_ROWS, MOST_TABLE
 from dora.errors import InputError
 from dora.files import write_bytes
+from dora.reading import read_bytes
 
 COLUMNS = ("env_steps", "seconds", "episodes", "success_rate", "raw_success_rate", "return_mean", "penetration_mm")
 """First columns; those of the stages follow. Rates and means are over the episodes that ended in the iteration."""
+MOST_RESUMED = 2**28
+"""Size of a table above which its run is not gone on with [bytes]."""
 STAGE = "stage/"
 """Beginning of the name of a stage's column."""
 
 
 def read_progress(path: Path) -> dict[str, Float[np.ndarray, " rows"]]:
     """Columns of the table by name, NaN where a cell is empty. A row that was being written when its run was killed is
-    left out, with all that follow it."""
-    header, rows = _whole_rows(path)
+    left out, with all that follow it.
+
+    Raises:
+        InputError: it is too large, or its first line is damaged.
+    """
+    header, rows = _whole_rows(path, MOST_TABLE)
+    if len(header) > MOST_COLUMNS or len(rows) > MOST_ROWS:
+        raise InputError(f"{path} has {len(header)} columns and {len(rows)} rows, more than a report reads: remove it.")
+    if not set(COLUMNS) <= set(header) or len(set(header)) < len(header):
+        raise InputError(f"{path} is damaged (its first line lacks a column, or has one twice): remove it.")
     values = np.array([[float(cell or "nan") for cell in row] for row in rows]).reshape(len(rows), len(header))
     return {name: values[:, k] for k, name in enumerate(header)}
 
 
-def _whole_rows(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Header and rows as text, up to the first row that is damaged."""
-    lines = path.read_text(errors="replace").split("\n")[:-1]  # what no line break ends is torn
+def _whole_rows(path: Path, most: int) -> tuple[list[str], list[list[str]]]:
+    """Header and rows as text, up to the first row that is damaged, of a file of at most `most` bytes."""
+    content = read_bytes(path, "progress.csv", most).decode("utf-8", "replace")
+    lines = content.split("\n")[:-1]  # what no line break ends is torn
     header = lines[0].split(",") if lines else []
     rows = []
     for line in lines[1:]:
@@ -40,10 +53,9 @@ def _whole_rows(path: Path) -> tuple[list[str], list[list[str]]]:
 
 def _is_cell(text: str) -> bool:
     try:
-        float(text or "nan")
+        return not abs(float(text or "nan")) >= LARGEST
     except ValueError:
         return False
-    return True
 
 
 class ProgressTable:
@@ -60,7 +72,7 @@ class ProgressTable:
 
     def __init__(self, path: Path, stages: Sequence[str], env_steps: int = 0):
         self.path, self.columns = path, [*COLUMNS, *(STAGE + name for name in stages)]
-        header, rows = _whole_rows(path) if env_steps > 0 and path.exists() else ([], [])
+        header, rows = _whole_rows(path, MOST_RESUMED) if env_steps > 0 and path.exists() else ([], [])
         kept = [row for row in rows if float(row[0]) <= env_steps] if header == self.columns else []
         write_bytes(path, "".join(f"{','.join(row)}\n" for row in (self.columns, *kept)).encode())
 

@@ -5,29 +5,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from dora.agents.config import LEARNER_CONFIGS, RunConfig
-from dora.configs import check_finite, overridden
+from dora.agents.limits import check
+from dora.configs import overridden
 from dora.errors import InputError
 from dora.parallel import available_cores
 
 WITHOUT_PRIOR: dict[str, dict[str, Any]] = {"sac": {"prior": 0.0}}
 """Settings of each learner where actions are no residuals and zero action is no prior to be pulled to."""
-POSITIVE = ("total_steps", "num_envs", "eval_every", "eval_episodes", "final_episodes", "eval_envs")
-"""Settings that have to be at least 1."""
-SHARES = ("gamma", "gae_lambda", "polyak")
-"""Settings of learners that have to be from 0 to 1."""
-COUNTS = ("rollout", "epochs", "minibatch", "batch", "capacity", "n_step")
-"""Settings of learners that have to be at least 1."""
-RATES = ("learning_rate", "learning_rate_min", "learning_rate_max", "learning_rate_actor", "learning_rate_alpha",
-         "updates_per_step", "grad_norm", "clip", "target_kl", "alpha")  # fmt: skip
-"""Settings of learners that have to be above 0."""
-LIMITS = (
-    (SHARES, lambda value: 0 <= value <= 1, "from 0 to 1"),
-    (COUNTS, lambda value: value >= 1, "at least 1"),
-    (RATES, lambda value: value > 0, "above 0"),
-    (("noise_correlation",), lambda value: 0 <= value < 1, "at least 0 and below 1"),
-    (("hidden",), lambda widths: all(width >= 1 for width in widths), "widths of at least 1"),
-)
-"""Settings of learners, the test of each, and its words."""
 ALL: Mapping[str, Mapping[str, Any]] = {name: {} for name in LEARNER_CONFIGS}
 """The learners of a task that recommends nothing."""
 
@@ -59,24 +43,3 @@ def recommended(
     config = dataclasses.replace(config, learner=overridden(LEARNER_CONFIGS[agent](), learner, "learner"))
     check(config)
     return config
-
-
-def check(config: RunConfig) -> None:
-    """Refuse settings that make no sense.
-
-    Raises:
-        InputError: naming the first of them.
-    """
-    for name in POSITIVE:
-        if getattr(config, name) < 1:
-            flag = "episodes" if name == "final_episodes" else name.replace("_", "-")
-            raise InputError(f"--{flag} is {getattr(config, name)} and has to be at least 1.")
-    for name in ("workers", "seed"):
-        if getattr(config, name) < 0:
-            raise InputError(f"--{name} is {getattr(config, name)} and cannot be negative.")
-    check_finite(config.learner, "learner")
-    for names, fits, words in LIMITS:
-        for name in names:
-            value = getattr(config.learner, name, None)
-            if value is not None and not fits(value):
-                raise InputError(f"--learner.{name.replace('_', '-')} is {value} and has to be {words}.")

@@ -1,6 +1,5 @@
 """Tables and curves from finished runs: everything a README may claim, made from files."""
 
-import html
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, stdev
@@ -9,14 +8,19 @@ from urllib.parse import quote
 from dora.agents.evaluation.intervals import share_text
 from dora.agents.runs.figures import SECONDS_PER_MINUTE, draw_curves
 from dora.agents.runs.run_results import DEFAULT_PRESET, Run, find_runs, grouped, success_shares, zero_shares
-from dora.files import write_bytes
-from dora.tables import html_page, markdown_table
+from dora.digests import digest_of
+from dora.files import make_folder, write_bytes
+from dora.tables import html_page, markdown_table, markdown_text
 
+LONGEST_FILE = 180
+"""Largest number of characters of the name of a figure, without its ending [1]."""
 HEADINGS = (
     "task", "preset", "agent", "guidance", "seeds", "success %", "each seed %", "scripted (zero correction) %",
     "penetration p95 mm", "steps", "minutes",
 )  # fmt: skip
 """Of the table."""
+NAMES = 4
+"""Number of its first columns, which hold names from files."""
 PAGE = """\
 <!doctype html>
 <meta charset="utf-8">
@@ -86,19 +90,29 @@ def table_rows(runs: Sequence[Run]) -> list[list[str]]:
 def tables(runs: Sequence[Run]) -> str:
     """`table_rows` as Markdown, success in bold; names are escaped."""
     at = HEADINGS.index("success %")
-    rows = [[html.escape(cell, quote=False) for cell in row] for row in table_rows(runs)]
+    rows = [[*map(markdown_text, row[:NAMES]), *row[NAMES:]] for row in table_rows(runs)]
     return markdown_table(HEADINGS, [[*row[:at], f"**{row[at]}**", *row[at + 1 :]] for row in rows]) + "\n"
 
 
+def file_name(name: str) -> str:
+    """A name as that of a file, cut where it would be too long, with some of its digest then."""
+    quoted = quote(name, safe="")
+    return quoted if len(quoted) <= LONGEST_FILE else f"{quoted[:LONGEST_FILE]}-{digest_of(name)[:8]}"
+
+
 def write_report(root: Path, out: Path) -> list[Path]:
-    """Writes `tables.md`, a figure for each task and preset, and `report.html` into `out`; returns their paths."""
+    """Writes `tables.md`, a figure for each task and preset, and `report.html` into `out`; returns their paths.
+
+    Raises:
+        InputError: there is no finished run, a file of one is damaged, or `out` cannot be written.
+    """
     runs = find_runs(root)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     write_bytes(out / "tables.md", f"{tables(runs)}\n{NOTE}\n".encode())
     figures = []
     for env, preset in sorted({run.group[:2] for run in runs if run.curve or run.progress}):
         name = env if preset == DEFAULT_PRESET else f"{env}-{preset}"
-        figures.append(out / f"{quote(name, safe='')}.png")
+        figures.append(out / f"{file_name(name)}.png")
         draw_curves(runs, env, preset, figures[-1])
     rows, names = table_rows(runs), [p.name for p in figures]
     page = html_page(PAGE, root=root.name, head=HEADINGS, rows=rows, note=NOTE, figures=names)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.metadata
+import os
 import platform
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,18 @@ import yaml
 
 from dora.agents.config import RunConfig, config_from_dict
 from dora.agents.evaluation.evaluate import Evaluation
+from dora.agents.limits import check
 from dora.configs import plain
 from dora.errors import InputError
 from dora.files import write_bytes, write_csv, write_json
+from dora.reading import read_yaml
 from dora.version import source_commit
 
 PACKAGES = ("dora", "mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 """Packages whose versions are written."""
+OWN_FILES = ("config.yaml", "result.json", "curve.csv", "eval.csv", "progress.csv", "checkpoints/latest.safetensors",
+             "checkpoints/best.safetensors")  # fmt: skip
+"""Files by which a folder is known to hold a run."""
 CURVE_HEADER = (
     "env_steps",
     "wall_seconds",
@@ -69,14 +75,32 @@ class RunFolder:
         """Folder of films."""
         return self.path / "video"
 
+    def check_free(self) -> None:
+        """Refuse a folder in which no run can be begun, before any work.
+
+        Raises:
+            InputError: if it holds a run already, or cannot be made or written.
+        """
+        try:
+            found = [name for name in OWN_FILES if (self.path / name).exists()]
+            above = next(path for path in (self.path, *self.path.absolute().parents) if path.exists())
+            fits = above.is_dir() and os.access(above, os.W_OK | os.X_OK)
+        except (OSError, ValueError) as error:
+            raise InputError(f"Cannot make the run folder {self.path} ({error}): choose another --out.") from error
+        if found:
+            raise InputError(
+                f"{self.path} holds a run already ({found[0]}): continue it with --resume or choose another --out."
+            )
+        if not fits:
+            raise InputError(f"Cannot make the run folder {self.path} (nothing can be written): choose another --out.")
+
     def create(self, config: RunConfig) -> None:
         """Make the folder and write `config.yaml` and `versions.txt`.
 
         Raises:
             InputError: if it cannot be written or holds a run already.
         """
-        if (self.path / "config.yaml").exists():
-            raise InputError(f"{self.path} holds a run already: continue it with --resume or choose another --out.")
+        self.check_free()
         try:
             self.checkpoints.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -96,15 +120,15 @@ class RunFolder:
         Raises:
             InputError: if this is not a run folder, or its settings do not fit this version.
         """
+        path = self.path / "config.yaml"
+        if not path.is_file():
+            raise InputError(f"{self.path} is not a run folder (no readable config.yaml): give one that a run printed.")
+        config = config_from_dict(read_yaml(path, "file of settings"), f"the settings in {path}")
         try:
-            content = yaml.safe_load((self.path / "config.yaml").read_text())
-        except (OSError, yaml.YAMLError, ValueError) as error:
-            raise InputError(
-                f"{self.path} is not a run folder (no readable config.yaml): give one that a run printed."
-            ) from error
-        if not isinstance(content, dict):
-            raise InputError(f"{self.path / 'config.yaml'} holds no settings: give a folder that a run printed.")
-        return config_from_dict(content)
+            check(config)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        return config
 
     def write_curve(self, rows: list[list[Any]]) -> None:
         """Write `curve.csv`."""

@@ -1,7 +1,5 @@
 """Finished runs as they lie in folders, and which of them make one row of a report."""
 
-import csv
-import json
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,10 +11,9 @@ from jaxtyping import Float
 
 from dora.agents.evaluation.evaluate import FINAL_SEED
 from dora.agents.runs.progress_table import read_progress
+from dora.agents.runs.stored_results import read_curve, read_result
 from dora.errors import InputError
 
-CURVE_COLUMNS = ("env_steps", "wall_seconds", "success_rate", "return_mean", "penetration_p95_mm")
-"""Columns of a learning curve that a report reads."""
 DEFAULT_PRESET = "standard"
 """Preset of a run of a Dora task that names none."""
 
@@ -60,22 +57,14 @@ def find_runs(root: Path) -> list[Run]:
     """
     runs = []
     for path in sorted(root.rglob("result.json")):
-        try:
-            result = json.loads(path.read_text())
-        except json.JSONDecodeError as error:
-            raise InputError(f"{path} is damaged ({error}); repeat the run or remove its folder.") from error
+        result = read_result(path)
         curve, progress = path.with_name("curve.csv"), path.with_name("progress.csv")
-        if result.get("finished"):
-            rows = _rows(curve) if curve.exists() else []
+        if result is not None:
+            rows = read_curve(curve) if curve.exists() else []
             runs.append(Run(path.parent, result, rows, read_progress(progress) if progress.exists() else {}))
     if not runs:
         raise InputError(f"there is no finished run under {root}: point at a folder with result.json files in it.")
     return runs
-
-
-def _rows(path: Path) -> list[dict[str, float]]:
-    with path.open() as file:
-        return [{k: float(row[k]) for k in CURVE_COLUMNS} for row in csv.DictReader(file)]
 
 
 def grouped(runs: Sequence[Run]) -> dict[Group, list[Run]]:

@@ -20,6 +20,7 @@ from dora.agents.checkpoint import (
     unpack_modules,
     unpack_optimisers,
     unpack_rng,
+    whole,
 )
 from dora.agents.collecting.rollouts import Rollouts
 from dora.agents.collecting.task_env import EpisodeColumns, MakeTask, ended_episodes
@@ -31,6 +32,7 @@ from dora.agents.runs.interrupt import Interrupt
 from dora.agents.runs.logging import RunLog
 from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.run_folder import RunFolder, make_result
+from dora.configs import built
 from dora.progress import ProgressDisplay
 
 TRAINING_SEEDS = 1_000_000_000
@@ -154,7 +156,8 @@ class Trainer:
             ahead=self.learner.replay is not None,
         )
         if self._resumed is not None:
-            unpack_rng(self._resumed)
+            with whole(self.folder.latest):
+                unpack_rng(self._resumed)
         else:
             torch.manual_seed(self._exploration_seed)
         return rollouts
@@ -268,7 +271,7 @@ class Trainer:
         """
         replay = self.learner.replay
         if replay is not None:
-            replay.save(self.folder.replay)
+            replay.save(self.folder.replay, self.config.digest())
         tensors = pack_modules(self.learner.modules) | pack_optimisers(self.learner.optimisers) | pack_rng()
         self._checkpoint(tensors).write(self.folder.latest)
         if replay is not None:
@@ -283,12 +286,13 @@ class Trainer:
         checkpoint = read_checkpoint(path)
         check_belongs(checkpoint, path, self.config, self.sizes, exactly=True)
         unpack_modules(self.learner.modules, checkpoint.tensors, path)
-        unpack_optimisers(self.learner.optimisers, checkpoint.tensors)
         progress = dict(checkpoint.progress)
-        self.learner.set_counters(progress.pop("learner"))
-        self.counters = Counters(**progress)
+        with whole(path):
+            unpack_optimisers(self.learner.optimisers, checkpoint.tensors)
+            self.learner.set_counters(progress.pop("learner"))
+            self.counters = built(Counters, progress)
         if self.learner.replay is not None:
-            self.learner.replay.load(self.folder.replay)
+            self.learner.replay.load(self.folder.replay, self.config.digest())
         self._resumed = checkpoint.tensors
 
 

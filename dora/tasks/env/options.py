@@ -8,8 +8,8 @@ import torch
 from mani_skill.agents.registration import REGISTERED_AGENTS
 
 from dora.affordance.candidates import GraspCandidates
-from dora.configs import check_finite, check_not_negative, overridden
-from dora.errors import InputError
+from dora.configs import check_finite, check_not_negative, check_ranges, overridden
+from dora.errors import InputError, shown
 from dora.robot import available_robots
 from dora.sim.batch.hooks import STATE_MODES
 from dora.sim.batch.rendering import can_render
@@ -21,6 +21,12 @@ from dora.tasks.mdp.randomisation import find_preset
 
 STATE_MODES_OR_DEFAULT = (None, *STATE_MODES)
 """Observation modes that need no pictures, with that of a task that is asked for none."""
+RATES = {"control_frequency": (1, 10_000), "physics_frequency": (1, 1_000_000), "solver_iterations": (1, 255)}
+"""Lowest and highest rates [Hz], and position iterations, of which PhysX takes 255."""
+MOST_DELAY = 1000
+"""Largest delay of an action [control steps]."""
+MOST_ENVS = 100_000
+"""Largest number of environments of a batch [1]."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +58,11 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Any) -> TaskConfig:
         if getattr(config.randomisation, name) >= 1:
             width = getattr(config.randomisation, name)
             raise InputError(f"config.randomisation.{name} is {width}; it is a share and has to be below 1.")
-    for name in ("control_frequency", "physics_frequency", "solver_iterations"):
-        if getattr(config, name) < 1:
-            raise InputError(f"config.{name} is {getattr(config, name)}; it has to be at least 1.")
+    low, high = config.randomisation.friction
+    if not 0 <= low <= high:
+        raise InputError(f"config.randomisation.friction is {low, high}; it has to be a lowest and a highest value.")
+    check_ranges(config, RATES, lambda name: f"config.{name}")
+    check_ranges(config.randomisation, {"delay": (0, MOST_DELAY)}, lambda name: f"config.randomisation.{name}")
     if config.physics_frequency % config.control_frequency:
         raise InputError(
             f"config.physics_frequency is {config.physics_frequency} Hz; it has to be a multiple of "
@@ -90,8 +98,8 @@ def check_options(
         raise InputError(
             f"hand_joints must be 20, or 15 with distal joints coupled to medial ones, not {hand_joints!r}"
         )
-    if not isinstance(num_envs, int) or num_envs < 1:
-        raise InputError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
+    if not isinstance(num_envs, int) or not 1 <= num_envs <= MOST_ENVS:
+        raise InputError(f"num_envs must be a whole number from 1 to {MOST_ENVS}, not {shown(num_envs)}")
     robots = _robots(robot_uids, arms)
     mode = control_mode or CONTROL_MODES[0]
     if hand_joints == 15 and not mode.endswith(COUPLED):

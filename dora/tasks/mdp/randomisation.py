@@ -1,5 +1,6 @@
 """How much an episode is randomised and perturbed: named presets, the same for every task."""
 
+import difflib
 from dataclasses import dataclass
 
 from dora.errors import InputError
@@ -74,5 +75,7 @@ PRESETS: dict[str, Randomisation] = {
 def find_preset(name: str) -> Randomisation:
     """The preset called `name`; raises InputError for an unknown one."""
     if name not in PRESETS:
-        raise InputError(f"unknown preset {name!r}; choose one of {', '.join(PRESETS)}")
+        near = difflib.get_close_matches(str(name), PRESETS, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise InputError(f"unknown preset {name!r}{hint} (choose one of {', '.join(PRESETS)})")
     return PRESETS[name]

@@ -1,0 +1,82 @@
+"""Ranges of the settings of runs and learners, and the check that a run's are within them."""
+
+from dora.agents.config import RunConfig
+from dora.configs import check_finite, check_ranges
+from dora.errors import InputError
+
+MOST_TRANSITIONS = 100_000_000
+"""Largest product of environments, workers and control steps of an iteration, and of a replay buffer [1]."""
+MOST_LAYERS, WIDEST = 16, 4096
+"""Largest number of hidden layers, and of their units [1]."""
+RUN = {
+    "seed": (0, 2**31 - 1),
+    "total_steps": (1, 10**12),
+    "num_envs": (1, 100_000),
+    "workers": (0, 512),
+    "learner_threads": (1, 512),
+    "eval_every": (1, 10**12),
+    "eval_episodes": (1, 100_000),
+    "final_episodes": (1, 1_000_000),
+    "eval_envs": (1, 100_000),
+    "stop_success": (0, 1),
+    "checkpoint_seconds": (0, 10**9),
+    "normaliser_samples": (0, 10**12),
+}
+"""Lowest and highest value of the settings of a run."""
+SHARE, RATE, LOGARITHM = (0, 1), (1e-12, 1e3), (-30, 10)
+"""Lowest and highest share, rate or norm, and logarithm of a deviation."""
+LEARNER = {
+    "rollout": (1, 100_000),
+    "epochs": (1, 10_000),
+    "minibatch": (1, MOST_TRANSITIONS),
+    "batch": (1, 10**6),
+    "capacity": (1, MOST_TRANSITIONS),
+    "n_step": (1, 10_000),
+    "warmup": (0, 10**12),
+    "critic_only": (0, 10**12),
+    "gamma": SHARE,
+    "gae_lambda": SHARE,
+    "polyak": SHARE,
+    "noise_correlation": (0, 1 - 1e-9),
+    "learning_rate": RATE,
+    "learning_rate_min": RATE,
+    "learning_rate_max": RATE,
+    "learning_rate_actor": RATE,
+    "learning_rate_alpha": RATE,
+    "updates_per_step": RATE,
+    "grad_norm": (1e-12, 1e9),
+    "clip": RATE,
+    "target_kl": RATE,
+    "alpha": RATE,
+    "entropy": (-1e6, 1e6),
+    "value": (0, 1e6),
+    "bound": (0, 1e6),
+    "prior": (0, 1e6),
+    "target_entropy": (-1e6, 1e6),
+    "log_std": LOGARITHM,
+    "log_std_min": LOGARITHM,
+    "log_std_max": LOGARITHM,
+}
+"""Lowest and highest value of the settings of learners."""
+FLAGS = {"final_episodes": "episodes"}
+"""Options whose name is not that of their setting."""
+
+
+def check(config: RunConfig) -> None:
+    """Refuse settings that make no sense or for which no machine is large enough.
+
+    Raises:
+        InputError: naming the option of the first of them.
+    """
+    check_ranges(config, RUN, lambda name: f"--{FLAGS.get(name, name).replace('_', '-')}")
+    check_finite(config.learner, "learner")
+    check_ranges(config.learner, LEARNER, lambda name: f"--learner.{name.replace('_', '-')}")
+    hidden = config.learner.hidden
+    if len(hidden) > MOST_LAYERS or not all(1 <= width <= WIDEST for width in hidden):
+        raise InputError(f"--learner.hidden has to be at most {MOST_LAYERS} widths from 1 to {WIDEST}.")
+    at_once = config.num_envs * max(config.workers, 1) * config.learner.rollout
+    if at_once > MOST_TRANSITIONS:
+        raise InputError(
+            f"--num-envs, --workers and --learner.rollout make {at_once} transitions at once, "
+            f"which has to be at most {MOST_TRANSITIONS}: lower one of them."
+        )

@@ -1,0 +1,252 @@
+"""The loaders of the package, each with small intact files, for `damage.py` and `test_damage.py`."""
+
+import functools
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+import yaml
+from boxes import two_regions
+from damage import Loader
+from tensordict import TensorDict
+
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.maps.affordance_map import AffordanceMap
+from dora.affordance.objects import decomposition
+from dora.affordance.objects.folder_reading import read_object_folder
+from dora.affordance.objects.folder_writing import write_object_folder
+from dora.affordance.objects.importing import read_mesh
+from dora.affordance.objects.labels import read_labels
+from dora.affordance.objects.surface_repair import repair
+from dora.affordance.reach.feasibility_table import Grid, ReachTable
+from dora.agents.checkpoint import Checkpoint, read_checkpoint
+from dora.agents.config import RunConfig, SACConfig
+from dora.agents.evaluation.play import load_policy
+from dora.agents.learners.learner import make_learner
+from dora.agents.learners.replay import Replay
+from dora.agents.runs.progress_table import ProgressTable
+from dora.agents.runs.report import tables, write_report
+from dora.agents.runs.run_folder import RunFolder
+from dora.agents.runs.run_results import find_runs
+from dora.robot import loading
+from dora.robot.build import write_urdf
+
+ROOT = Path(__file__).parents[1]
+ROBOT = ROOT / "robots" / "diana7_hit"
+CONFIG = RunConfig("DoraCube-v1", "ppo", "none", task={"lift": 0.1, "weights": {"lift": 3.0}}, seed=3)
+FACES = 12
+"""Faces of the box."""
+GRID, DIGEST = Grid((0.5, 0.0), (0.0, 0.0), yaws=6), "0" * 64
+
+
+def write_checkpoint(folder: Path) -> None:
+    torch.manual_seed(0)
+    tensors = {}
+    for name, module in make_learner(CONFIG, 7, 3).policy.modules_by_name.items():
+        tensors |= {f"{name}/{key}": value for key, value in module.state_dict().items()}
+    Checkpoint(CONFIG, (7, 3), tensors, {"env_steps": 100, "curve": [[1, 2.0, 0.5]]}).write(folder / "a.safetensors")
+
+
+def load_checkpoint(folder: Path) -> object:
+    return load_policy(read_checkpoint(folder / "a.safetensors"), folder)
+
+
+def replay_of(rows: int) -> Replay:
+    replay = Replay(64, 8)
+    values = torch.arange(rows, dtype=torch.float32)[:, None]
+    replay.extend(TensorDict({"observation": values, "next": {"reward": -values}}, batch_size=[rows]))
+    return replay
+
+
+def load_replay(folder: Path) -> None:
+    replay = Replay(64, 8)
+    replay.added = 20
+    replay.load(folder, "run")
+    replay.sample()
+
+
+def write_candidates(folder: Path) -> None:
+    unit = torch.nn.functional.normalize(torch.ones(5, 4), dim=-1)
+    found = GraspCandidates(
+        "box", torch.zeros(5, 3), unit, torch.eye(3)[[0, 1, 2, 0, 1]], torch.zeros(5, 20), torch.ones(5, 20),
+        ("BodyGrasp", "SideGrasp") * 2 + ("BodyGrasp",), contacts=torch.zeros(5, 2, 3),
+        contact_finger=torch.tensor([[1, 2]] * 5), contact_map=torch.eye(5, dtype=torch.uint8),
+        energy={"distance": torch.rand(5)}, settings=json.dumps({"ranking_steps": 3}),
+    )  # fmt: skip
+    found.save(folder / "grasps.safetensors")
+
+
+def load_candidates(folder: Path) -> object:
+    return GraspCandidates.load(folder / "grasps.safetensors").ranking_steps
+
+
+def write_table(folder: Path) -> None:
+    reason = torch.zeros(6, 4, dtype=torch.uint8)
+    ReachTable(GRID, (1.0, 0.0, 0.0, 0.0), 0.03, reason, DIGEST).save(folder / "reach.safetensors")
+
+
+def load_table(folder: Path) -> object:
+    return ReachTable.load(folder / "reach.safetensors", DIGEST, GRID, 0.03, (1.0, 0.0, 0.0, 0.0))
+
+
+def write_hulls(folder: Path) -> None:
+    decomposition._save(folder / "hulls.safetensors", [trimesh.creation.box((0.1, 0.1, 0.1))])
+
+
+def load_hulls(folder: Path) -> object:
+    return decomposition._load(folder / "hulls.safetensors")
+
+
+def write_map(folder: Path) -> None:
+    AffordanceMap.from_object(two_regions(), 64).save(folder / "map.safetensors")
+
+
+def load_map(folder: Path) -> object:
+    return AffordanceMap.load(folder / "map.safetensors")
+
+
+def write_config(folder: Path) -> None:
+    RunFolder(folder).write_config(CONFIG)
+
+
+def write_first_config(folder: Path) -> None:
+    """Settings of the version without numbers of the task, of the other learner."""
+    content = RunConfig("DoraJug-v1", "sac", "affordance", learner=SACConfig())  # pyright: ignore[reportArgumentType]
+    RunFolder(folder).write_config(content)
+    text = yaml.safe_load((folder / "config.yaml").read_text())
+    text = {k: v for k, v in text.items() if k not in ("preset", "guidance_parts", "reward")}
+    (folder / "config.yaml").write_text(yaml.safe_dump(text | {"task": {"preset": "hard"}}))
+
+
+def load_config(folder: Path) -> object:
+    from dora.tasks import find_task
+    from dora.tasks.env.options import task_config
+
+    config = RunFolder(folder).read_config()
+    return task_config(find_task(config.env).CONFIG, config.preset, config.task)
+
+
+def write_result(folder: Path) -> None:
+    result: dict[str, Any] = {
+        "env": "Toy-v1", "agent": "ppo", "guidance": "affordance", "seed": 0, "env_steps": 1000, "wall_seconds": 90.0,
+        "success_rate": 0.5, "zero_success_rate": 0.5, "penetration_p95_mm": 2.0, "finished": True,
+        "eval_episodes": 200, "total_steps": 1000, "first_seed": 5, "preset": "standard", "guidance_parts": ["prior"],
+    }  # fmt: skip
+    (folder / "result.json").write_text(json.dumps(result))
+    head = "env_steps,wall_seconds,success_rate,return_mean,penetration_p95_mm,training_success_rate"
+    (folder / "curve.csv").write_text(f"{head}\n500,45,0.1,3,2,0.1\n1000,90,0.5,9,nan,0.4\n")
+    table = ProgressTable(folder / "progress.csv", ["reach"])
+    for step in range(100, 1100, 100):
+        table.add({"env_steps": step, "seconds": step / 10, "episodes": 3, "success_rate": 0.5, "return_mean": 1.0})
+
+
+def load_results(folder: Path) -> object:
+    return tables(find_runs(folder))
+
+
+def load_report(folder: Path) -> object:
+    return write_report(folder, folder / "out")
+
+
+def write_robot(folder: Path) -> None:
+    for name in ("robot.toml", "robot.urdf"):
+        shutil.copy(ROBOT / name, folder)
+
+
+def load_robot(folder: Path) -> object:
+    loading._load.cache_clear()
+    return loading.load_robot(folder).collision_bits()
+
+
+def write_parameters(folder: Path) -> None:
+    shutil.copy(ROBOT / "parameters.yaml", folder)
+
+
+def write_object(folder: Path) -> None:
+    write_object_folder(two_regions(), folder / "box")
+
+
+def load_object(folder: Path) -> object:
+    return read_object_folder(folder / "box")
+
+
+def box() -> trimesh.Trimesh:
+    return trimesh.creation.box((0.05, 0.06, 0.07))
+
+
+def write_mesh(ending: str, folder: Path) -> None:
+    scene = trimesh.Scene()
+    for name, shift in (("one", 0.0), ("two", 0.03)):
+        mesh = box()
+        mesh.apply_translation((shift, 0, 0))
+        scene.add_geometry(mesh, geom_name=name, node_name=name)
+    if ending in ("glb", "gltf", "3mf"):
+        found = scene.export(file_type=ending)
+        for name, content in found.items() if isinstance(found, dict) else [(f"thing.{ending}", found)]:
+            assert isinstance(content, bytes)
+            (folder / name.replace("model.gltf", "thing.gltf")).write_bytes(content)
+    else:
+        box().export(folder / f"thing.{ending}")
+
+
+def load_mesh(ending: str, folder: Path) -> object:
+    """All of an import but the decomposition, which takes seconds."""
+    mesh, names = read_mesh(folder / f"thing.{ending}")
+    return repair(mesh, np.zeros(len(names), np.int64), "thing")
+
+
+def write_labels(ending: str, folder: Path) -> None:
+    path = folder / f"labels.{ending}"
+    names = ["handle"] * 5 + ["body"] * 7
+    if ending == "npy":
+        np.save(path, np.array([0] * 5 + [1] * 7))
+    elif ending == "json":
+        path.write_text(json.dumps({"labels": ["handle", "body"], "faces": [0] * 5 + [1] * 7, "target": "body"}))
+    elif ending == "yaml":
+        low, high = {"min": [-1, -1, 0.02], "max": [1, 1, 1]}, {"point": [0, 0, 0], "normal": [0, 0, -1.0]}
+        path.write_text(yaml.safe_dump({"regions": {"top": {"box": low}, "low": [{"plane": high}]}, "rest": "body"}))
+    else:
+        path.write_text("\n".join(names))
+
+
+def load_labels(ending: str, folder: Path) -> object:
+    return read_labels(folder / f"labels.{ending}", np.array(box().triangles_center))
+
+
+def with_ending(function: Callable[[str, Path], object], ending: str) -> Callable[[Path], object]:
+    return functools.partial(function, ending)
+
+
+LOADERS: dict[str, Loader] = {
+    "checkpoint": Loader(write_checkpoint, load_checkpoint, sealed=True),
+    "replay": Loader(lambda folder: replay_of(20).save(folder, "run"), load_replay, sealed=True),
+    "candidates": Loader(write_candidates, load_candidates, sealed=True),
+    "reach table": Loader(write_table, load_table, sealed=True),
+    "hulls in the cache": Loader(write_hulls, load_hulls, sealed=True),
+    "affordance map": Loader(write_map, load_map, sealed=True),
+    "config.yaml": Loader(write_config, load_config),
+    "config.yaml, first": Loader(write_first_config, load_config),
+    "result.json": Loader(write_result, load_results, ("result.json",)),
+    "curve.csv": Loader(write_result, load_results, ("curve.csv",)),
+    "progress.csv": Loader(write_result, load_results, ("progress.csv",)),
+    "report": Loader(write_result, load_report),
+    "robot.toml": Loader(write_robot, load_robot, ("robot.toml",)),
+    "robot.urdf": Loader(write_robot, load_robot, ("robot.urdf",)),
+    "parameters.yaml": Loader(write_parameters, write_urdf, ("parameters.yaml",)),
+    "object.toml": Loader(write_object, load_object, ("object.toml",)),
+    "object meshes": Loader(write_object, load_object, ("*.ply",)),
+    **{
+        f"mesh .{end}": Loader(with_ending(write_mesh, end), with_ending(load_mesh, end))
+        for end in ("3mf", "glb", "gltf", "obj", "off", "ply", "stl")
+    },
+    **{
+        f"labels .{end}": Loader(with_ending(write_labels, end), with_ending(load_labels, end))
+        for end in ("json", "npy", "txt", "yaml")
+    },
+}
+"""Every loader by its name."""

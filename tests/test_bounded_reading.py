@@ -1,0 +1,416 @@
+"""Files made to be expensive are refused in one sentence, at once and without memory."""
+
+import json
+import os
+import resource
+import struct
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from boxes import two_regions
+from probes import load_results, write_result
+
+from dora.affordance.maps.packed_maps import COUNT, PART, POINT, unpack
+from dora.affordance.objects.folder_reading import read_object_folder
+from dora.affordance.objects.importing import import_object, read_mesh
+from dora.affordance.objects.labels import read_labels
+from dora.affordance.views.page import describe, start_server
+from dora.agents.runs.report import write_report
+from dora.agents.runs.run_folder import RunFolder
+from dora.errors import InputError
+from dora.files import read_tensors
+from dora.reading import read_array, read_toml, read_xml, read_yaml
+from dora.robot.urdf import read_urdf
+from dora.tables import markdown_text
+
+CENTRES = np.zeros((12, 3))
+LAUGHS = "regions: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{chr(98 + i)}: &{chr(98 + i)} [{','.join(['*' + chr(97 + i)] * 10)}]\n" for i in range(9)
+)
+CURVE = "env_steps,wall_seconds,success_rate,return_mean,penetration_p95_mm"
+"""First line of a curve.csv."""
+ENTITIES = '<!DOCTYPE l [<!ENTITY a "aaaaaaaaaa">]>'
+LOOP = '<robot><link name="a"/><joint name="j" type="fixed"><parent link="a"/><child link="a"/></joint></robot>'
+"""A URDF of a link that is its own child."""
+MESH: dict[str, Any] = {
+    "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "bufferViews": [],
+    "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+    "accessors": [{"count": 300, "componentType": 5126, "type": "VEC3"},
+                  {"count": 300_000, "componentType": 5125, "type": "SCALAR"}],
+}  # fmt: skip
+"""A glTF file of 100,000 triangles without any data."""
+
+
+@contextmanager
+def refused(words: str, seconds: float = 3.0) -> Iterator[None]:
+    """Expects one sentence with these words, soon, and no growth of the memory above 300 MB."""
+    start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match=words) as caught:
+        yield
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1300
+    assert time.perf_counter() - start < seconds
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000
+
+
+def written(path: Path, content: str | bytes) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def glb(header: dict[str, Any] | bytes) -> bytes:
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    return b"glTF" + struct.pack("<II", 2, 20 + len(text)) + struct.pack("<II", len(text), 0x4E4F534A) + text
+
+
+def npy(kind: str, shape: str, data: bytes = b"") -> bytes:
+    header = f"{{'descr': {kind!r}, 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + data
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (LAUGHS, "more than 100000 values, those of aliases included"),
+        ("a: &x [*x]\n", "alias \\*x of what does not stand before it"),
+        ("[" * 100_000, "not valid YAML"),
+        ("- " * 400_000, "more than 40 levels deep"),
+        ("a: &a {x: 1}\n" + "".join(f"b{i}: &b {{<<: *{'ab'[i > 0]}, y{i}: 1}}\n" for i in range(3000)), "aliases"),
+        ("x: " + "1_" * 400_000, "not valid YAML"),
+        ("x: 2020-01-01", "holds a date"),
+        ("x: !!python/object:os.system {}", "not valid YAML"),
+        ("x: 1\n" * 200_001, "may have at most 1000000"),
+    ],
+)
+def test_yaml(tmp_path: Path, text: str, words: str):
+    with refused(words):
+        read_yaml(written(tmp_path / "a.yaml", text), "file of settings")
+    with refused(words):
+        read_labels(written(tmp_path / "labels.yaml", text), CENTRES)
+    with refused(words):
+        RunFolder(written(tmp_path / "config.yaml", text).parent).read_config()
+
+
+def test_an_alias_that_stays_small_is_read(tmp_path: Path):
+    assert read_yaml(written(tmp_path / "a.yaml", "a: &x [1, 2]\nb: *x\n"), "file") == {"a": [1, 2], "b": [1, 2]}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[" * 200_000, "not valid JSON"),
+        ("[" + "[]," * 2_000_000 + "[]]", "more than 1000000 values"),
+        ('{"a":' * 60 + "1" + "}" * 60, "more than 40 levels deep"),
+        ('["\\ud800"]', "half a character"),
+        ("[" + "9" * 6000 + "]", "not valid JSON"),
+        ("[" + '["a"],' * 11 + '["a"]]', "give a name or a whole number"),
+        ('{"labels": 3, "faces": 4}', "must hold lists"),
+    ],
+)
+def test_json(tmp_path: Path, text: str, words: str):
+    with refused(words):
+        read_labels(written(tmp_path / "labels.json", text), CENTRES)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a" + ".a" * 400_000 + "=1", "100 dots"),
+        ("a=" + "{a=" * 100_000, "not valid TOML"),
+        ("a" + ".a" * 60 + "=1", "levels"),
+        ("a=2020-01-01", "holds a date"),
+    ],
+)
+def test_toml(tmp_path: Path, text: str, words: str):
+    with refused(words):
+        read_toml(written(tmp_path / "robot.toml", text), "file")
+    with refused(words):
+        read_object_folder(written(tmp_path / "object.toml", text).parent)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "no intact .npy file"),
+        (npy("<f8", "(10000000000000,)"), "declares"),
+        (npy("<U100000000", "(12,)"), "declares"),
+        (npy("<f8", "(10**13,)"), "no intact"),
+        (npy("<f8", "(-1,)", b"\0" * 96), "declares"),
+        (npy("|O", "(12,)", b"\0" * 96), "not numbers or texts"),
+        (npy("<f8", "(12,)", b"\xff" * 96), "not whole numbers"),
+        (npy("<U1", "(12,)", b"\xff" * 48), "no characters"),
+        (npy("<U1", "(12,)", struct.pack("<I", 0xD800) * 12), "no characters"),
+        (npy("|S1", "(12,)", b"\xff" * 12), "no text"),
+        (npy("<i8", "(1000,)", b"\0" * 8000), "1000 labels for the 12 triangles"),
+    ],
+)
+def test_arrays(tmp_path: Path, content: bytes, words: str):
+    with refused(words):
+        read_labels(written(tmp_path / "labels.npy", content), CENTRES)
+
+
+def test_an_array_is_read_in_its_order(tmp_path: Path):
+    for array in (np.arange(6).reshape(2, 3), np.asfortranarray(np.arange(6.0).reshape(2, 3)), np.array(["a", "bc"])):
+        np.save(tmp_path / "a.npy", array)
+        assert read_array(tmp_path / "a.npy", "file", 1000).tolist() == array.tolist()
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.obj", "a.ply", "a.glb", "a.gltf", "a.off", "a.3mf"])
+def test_huge_meshes_are_refused_by_their_size(tmp_path: Path, name: str):
+    with (tmp_path / name).open("wb") as stream:
+        stream.truncate(10**11)
+    with refused("at most 64000000", 1.0):
+        read_mesh(tmp_path / name)
+
+
+def test_other_huge_files_are_refused_by_their_size(tmp_path: Path):
+    readers: dict[str, Callable[[Path], object]] = {
+        "labels.npy": lambda path: read_labels(path, CENTRES),
+        "labels.txt": lambda path: read_labels(path, CENTRES),
+        "object.toml": lambda path: read_object_folder(path.parent),
+        "config.yaml": lambda p: RunFolder(p.parent).read_config(),
+        "robot.urdf": read_urdf,
+        "g.safetensors": lambda path: read_tensors(path, "dora-grasps 1"),
+        "result.json": lambda path: write_report(path.parent, path.parent / "out"),
+    }
+    for name, reader in readers.items():
+        with (tmp_path / name).open("wb") as stream:
+            stream.truncate(10**11)
+        with refused("may have at most", 1.0):
+            reader(tmp_path / name)
+
+
+def test_what_is_no_file_is_refused(tmp_path: Path):
+    os.mkfifo(tmp_path / "labels.yaml")
+    with refused("There is no label file", 1.0):
+        read_labels(tmp_path / "labels.yaml", CENTRES)
+    with refused("There is no mesh file"):
+        read_mesh(written(tmp_path / "x.stl" / "y", "").parent)
+    with refused("There is no"):
+        read_yaml(Path("a\0b.yaml"), "file")
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        (MESH | {"accessors": [{"count": 10**10, "componentType": 5126, "type": "VEC3"}]}, "declares"),
+        (MESH | {"nodes": [{"children": list(range(1, 5000))}, *[{"mesh": 0}] * 5000]}, "faces; reduce it"),
+        (MESH | {"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}, "contains itself"),
+        (MESH | {"nodes": [*({"children": [i + 1, i + 1]} for i in range(30)), {"mesh": 0}]}, "repeats its parts"),
+        (MESH | {"nodes": [{"children": [1, 1]}, {"mesh": 0}]}, "several parents"),
+        (MESH | {"nodes": [{}] * 10_001}, "more than 10000 nodes"),
+        (b'{"a":' + b"[" * 100_000, "not valid JSON"),
+        ([], "no glTF header"),
+    ],
+)
+def test_gltf(tmp_path: Path, header: Any, words: str):
+    with refused(words):
+        read_mesh(written(tmp_path / "a.glb", glb(header if isinstance(header, bytes) else header or b"[]")))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3\n" * 200_001, "200001 faces"),
+        ("a.obj", "v 0 0 0\n" * 1_500_001, "1500001 lines"),
+        ("a.off", "OFF\n3 600000 0\n" + "0 0 0\n" * 600_000, "600002 lines"),
+        ("a.ply", "ply\nformat ascii 1.0\n" + "0 0 0\n" * 600_000, "600002 lines"),
+    ],
+)
+def test_meshes_in_text_have_a_limit_of_lines(tmp_path: Path, name: str, content: str, words: str):
+    with refused(words):
+        read_mesh(written(tmp_path / name, content))
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "../../etc/passwd", "/etc/passwd"])
+def test_a_mesh_reads_no_files_elsewhere(tmp_path: Path, name: str):
+    content = MESH | {"buffers": [{"uri": name, "byteLength": 10}]}
+    with refused("does not lie beside it"):
+        read_mesh(written(tmp_path / "a.gltf", json.dumps(content)))
+    mesh = f"mtllib {name}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    assert len(read_mesh(written(tmp_path / "a.obj", mesh))[0].faces) == 1
+
+
+def test_archives(tmp_path: Path):
+    with zipfile.ZipFile(tmp_path / "bomb.3mf", "w", zipfile.ZIP_DEFLATED) as archive:
+        for k in range(13):
+            archive.writestr(f"3D/{k}.model", b" " * 10_000_000)
+    with refused("unpacks to more than"):
+        read_mesh(tmp_path / "bomb.3mf")
+    for name, words in (("bomb.zip", "cannot be read as a mesh"), ("bomb.stl", "zip file")):
+        with refused(words):
+            read_mesh(written(tmp_path / name, (tmp_path / "bomb.3mf").read_bytes()))
+    with refused("packed .gzip."):
+        read_mesh(written(tmp_path / "a.obj", b"\x1f\x8b\x08"))
+    parts = "".join(
+        f'<object id="{i}"><components>' + f'<component objectid="{i + 1}"/>' * 4 + "</components></object>"
+        for i in range(1, 30)
+    )
+    namespace = 'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"'
+    for model, words in ((parts, "repeats its parts"), (f"{ENTITIES}", "declares a document type|not valid XML")):
+        with zipfile.ZipFile(tmp_path / "a.3mf", "w") as archive:
+            archive.writestr("3D/3dmodel.model", f"<model {namespace}>{model}</model>")
+        with refused(words):
+            read_mesh(tmp_path / "a.3mf")
+
+
+def test_many_loose_triangles(tmp_path: Path):
+    corners = np.random.default_rng(0).random((50_000, 3, 3))
+    trimesh.Trimesh(corners.reshape(-1, 3), np.arange(150_000).reshape(-1, 3), process=False).export(tmp_path / "a.stl")
+    with refused("falls into 50000 parts", 5.0):
+        import_object(tmp_path / "a.stl", cache_dir=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 999\n", "out of bounds|do not exist"),
+        ("v 0 0 0\nf -1 -2 -9\n", "out of bounds|do not exist"),
+        ("v 0\nv 1\nv 2\nf 1 2 3\n", "three numbers|cannot be read"),
+    ],
+)
+def test_faces_out_of_range(tmp_path: Path, content: str, words: str):
+    with refused(words):
+        read_mesh(written(tmp_path / "a.obj", content))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (f'<?xml version="1.0"?>{ENTITIES}<robot/>', "declares a document type"),
+        ("<a>" * 200_000 + "</a>" * 200_000, "40 levels"),
+        ("<robot>" + '<link name="a"/>' * 30_000 + "</robot>", "20000 elements"),
+        ("<robot>" + "".join(f'<link name="l{i}"/>' for i in range(2000)) + "</robot>", "more than 1000 links"),
+        ("<robot/>", "one tree"),
+        (LOOP, "one tree"),
+        ('<robot><link name="a"/><joint name="j" type="glued"/></robot>', "of the type 'glued'"),
+    ],
+)
+def test_urdf(tmp_path: Path, text: str, words: str):
+    with refused(words):
+        read_urdf(written(tmp_path / "a.urdf", text))
+
+
+def test_xml_that_is_small_is_read(tmp_path: Path):
+    assert read_xml(written(tmp_path / "a.xml", "<a><b c='1'/></a>"), "file")[0].get("c") == "1"
+
+
+@pytest.mark.parametrize(
+    ("table", "content", "words"),
+    [
+        ("curve.csv", "a," * 1_000_000, "lacks a column"),
+        ("curve.csv", '"' + "x" * 200_000, "damaged"),
+        ("curve.csv", f"{CURVE}\n" + "1,1,0,0,0\n" * 20_001, "rows"),
+        ("curve.csv", f"{CURVE}\n1,1,0,0\n", "line 2 has 4 cells"),
+        ("curve.csv", f"{CURVE}\nnan,1,0,0,0\n", "out of range"),
+        ("curve.csv", f"{CURVE}\n1,1,inf,0,0\n", "out of range"),
+        ("progress.csv", "x\n" * 300_000, "lacks a column|more than a report reads"),
+        ("progress.csv", "", "lacks a column"),
+    ],
+)
+def test_tables_of_runs(tmp_path: Path, table: str, content: str, words: str):
+    write_result(tmp_path)
+    load_results(tmp_path)
+    with refused(words):
+        write_report(written(tmp_path / table, content).parent, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("env", 3),
+        ("env", ""),
+        ("env", "x" * 300),
+        ("env_steps", 10**400),
+        ("wall_seconds", float("nan")),
+        ("finished", 1),
+        ("success_rate", None),
+        ("success_rate", 2),
+        ("first_seed", [1]),
+        ("task", {"guidance_parts": "abc"}),
+        ("task", 1),
+    ],
+)
+def test_results_of_another_type(tmp_path: Path, name: str, value: Any):
+    write_result(tmp_path)
+    result = json.loads((tmp_path / "result.json").read_text())
+    with refused("result.json is damaged"):
+        load_results(written(tmp_path / "result.json", json.dumps(result | {name: value})).parent)
+
+
+def test_names_from_files_are_text_in_figures_and_on_pages(tmp_path: Path):
+    write_result(tmp_path)
+    result = json.loads((tmp_path / "result.json").read_text())
+    name = "$\\frac{$_<b>[x](y)"
+    written(tmp_path / "result.json", json.dumps(result | {"env": name, "guidance": "$x_{$"}))
+    table, page, _ = write_report(tmp_path, tmp_path / "out")
+    assert "<b>" not in table.read_text() + page.read_text()
+    assert "[x](y)" not in table.read_text()
+    assert markdown_text("a\n*b* <i>") == "a \\*b\\* &lt;i&gt;"
+
+
+def test_names_of_classes_are_text_on_the_page(monkeypatch: pytest.MonkeyPatch):
+    from dora.affordance.candidates import GraspCandidates
+
+    zero, grasp = torch.zeros(1, 3), torch.zeros(1, 20)
+    candidates = GraspCandidates("box", zero, torch.tensor([[1.0, 0, 0, 0]]), zero, grasp, grasp, ("<b>*A*",),
+                                 energy={"<i>": torch.zeros(1)})  # fmt: skip
+    assert "<b>" not in describe(candidates, 0)
+    assert "<i>" not in describe(candidates, 0)
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "words"), [("127.0.0.1", 70_000, "from 1 to 65535"), ("no host", 8080, "no address")]
+)
+def test_no_page_without_an_address(host: str, port: int, words: str):
+    with refused(words, 10.0):
+        start_server(host, port, "page")
+
+
+def tensors_file(header: bytes, data: bytes = b"") -> bytes:
+    return struct.pack("<Q", len(header)) + header + data
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (struct.pack("<Q", 2**62) + b"{}", "size of its header"),
+        (tensors_file(b'{"a":' + b"[" * 100_000), "truncated, damaged"),
+        (tensors_file(b'{"a":{"dtype":"F32","shape":[1000000000000],"data_offsets":[0,0]}}'), "truncated, damaged"),
+        (
+            tensors_file(
+                b'{"__metadata__":{"format":"dora-grasps 1"},"a":{"dtype":"F32","shape":[0,4611686018427387904],'
+                b'"data_offsets":[0,0]}}'
+            ),
+            "damaged",
+        ),
+        (tensors_file(b" " * 5_000_000), "size of its header"),
+    ],
+)
+def test_tensors(tmp_path: Path, content: bytes, words: str):
+    with refused(words):
+        read_tensors(written(tmp_path / "a.safetensors", content), "dora-grasps 1")
+
+
+def test_maps_that_unpack_to_too_much():
+    empty = torch.zeros(0, dtype=torch.int32)
+    packed = {COUNT: torch.zeros(1000, dtype=torch.int32), POINT: empty, PART: empty.byte()}
+    with refused("more than 268435456 together"):
+        unpack(packed, 1000, 2**20, "a file")
+
+
+def test_an_object_of_two_regions_is_not_refused(tmp_path: Path):
+    """The bounds leave room for what is small."""
+    box = two_regions()
+    box.mesh.export(tmp_path / "a.glb")
+    assert len(read_mesh(tmp_path / "a.glb")[0].faces) == len(box.mesh.faces)
