@@ -25,3 +25,4 @@ def _is_command() -> bool:
 
 if not _is_command():
     from dora import registration as registration
+    from dora import tasks as tasks

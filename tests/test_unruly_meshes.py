@@ -17,10 +17,10 @@ from dora.affordance.objects.folder_writing import write_object_folder
 from dora.affordance.objects.importing import import_mesh, read_mesh
 from dora.affordance.objects.labels import FaceLabels, grasp_classes, read_labels, without_number
 from dora.affordance.objects.surface_repair import Repaired, repair
-from dora.affordance.views.page import legend_html, plain
+from dora.affordance.views.page import legend_html
 from dora.errors import InputError
 from dora.progress import ProgressDisplay
-from dora.tables import show_any_script
+from dora.tables import markdown_text, show_any_script
 
 RADIUS, HEIGHT = 0.03, 0.12
 """A cylinder, the body of most meshes here [m]."""
@@ -306,7 +306,7 @@ def test_names_that_look_equal_are_one_region():
 def test_names_are_shown_as_they_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     assert "<b>" not in legend_html("Regions", {"<b>把手</b>": (1, 2, 3)})
     assert "&lt;b&gt;把手" in legend_html("Regions", {"<b>把手</b>": (1, 2, 3)})
-    assert plain("a<b>{c}*") == r"a\<b\>\{c\}\*"
+    assert markdown_text("a<b>{c}*") == r"a&lt;b&gt;\{c\}\*"
     with (tmp_path / "out").open("w") as stream, ProgressDisplay(Console(file=stream)) as phases:
         phases.phase("[/handle]: search", "candidates")(1, 2)
     assert "[/handle]: search" in (tmp_path / "out").read_text()
