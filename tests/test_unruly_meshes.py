@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
+from dora.affordance.objects import importing
 from dora.affordance.objects.folder_reading import read_object_folder
 from dora.affordance.objects.folder_writing import write_object_folder
 from dora.affordance.objects.importing import import_mesh, read_mesh
@@ -243,14 +244,38 @@ PARTS = ("body", "grip.001", "grip_2")
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 @pytest.mark.parametrize("kind", ["o", "g", "usemtl"])
 def test_parts_of_obj_files_with_and_without_a_mark(kind: str, encoding: str, tmp_path: Path):
+    first = "mtllib a.mtl\n" if kind == "usemtl" else ""
     a, b, c = (f"{kind} {name}" for name in PARTS)
-    (tmp_path / "thing.obj").write_text(OBJ.format(first="mtllib a.mtl\n", a=a, b=b, c=c), encoding=encoding)
+    (tmp_path / "thing.obj").write_text(OBJ.format(first=first, a=a, b=b, c=c), encoding=encoding)
     (tmp_path / "a.mtl").write_text("".join(f"newmtl {name}\nKd 1 0 0\n" for name in PARTS), encoding=encoding)
     mesh, names = read_mesh(tmp_path / "thing.obj")
     assert sorted(names) == ["body"] * 4 + ["grip"] * 8
     assert mesh.bounds.tolist() == [[0, 0, 0], [0.9, 0.1, 0.1]]
     grip = np.array(names) == "grip"
     assert mesh.triangles_center[grip, 0].min() > 0.4 > mesh.triangles_center[~grip, 0].max()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_the_first_material_is_read_whatever_stands_before_it(encoding: str, tmp_path: Path):
+    text = OBJ.format(first="mtllib a.mtl\n", a="usemtl steel", b="usemtl wood", c="usemtl wood")
+    (tmp_path / "thing.obj").write_text(text)
+    (tmp_path / "a.mtl").write_text("newmtl steel\nKd 1 0 0\n", encoding=encoding)
+    (tmp_path / "b.mtl").write_text("newmtl steel\n", encoding=encoding)
+    resolver = importing._Files(str(tmp_path / "thing.obj"))
+    assert resolver.get("b.mtl") == b"newmtl steel\n"
+    _, names = read_mesh(tmp_path / "thing.obj")
+    assert names.count("steel") == 4
+
+
+def test_copies_of_a_material_are_one_region(tmp_path: Path):
+    scene = trimesh.Scene()
+    for i, name in enumerate(("clay", "steel", "steel.001")):
+        part = cube(i * 0.04)
+        part.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(name=name))
+        scene.add_geometry(part, node_name=f"part.{i:03}", geom_name=f"part.{i:03}")
+    scene.export(tmp_path / "mug.glb")
+    _, names = read_mesh(tmp_path / "mug.glb")
+    assert list(dict.fromkeys(names)) == ["clay", "steel"]
 
 
 LABELS = {
@@ -309,6 +334,11 @@ def test_names_are_shown_as_they_are(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert markdown_text("a<b>{c}*") == r"a&lt;b&gt;\{c\}\*"
     with (tmp_path / "out").open("w") as stream, ProgressDisplay(Console(file=stream)) as phases:
         phases.phase("[/handle]: search", "candidates")(1, 2)
+    assert "[/handle]: search" in (tmp_path / "out").read_text()
+    with (tmp_path / "out").open("w") as stream:
+        terminal = Console(file=stream, force_terminal=True, width=80)
+        with ProgressDisplay(terminal) as phases:
+            phases.phase("[/handle]: search", "candidates")(1, 2)
     assert "[/handle]: search" in (tmp_path / "out").read_text()
     with (tmp_path / "ascii").open("w", encoding="ascii") as stream:
         monkeypatch.setattr("sys.stdout", stream)
