@@ -75,10 +75,10 @@ class ContactMonitor:
             readers = [scene.px.get_contacts]
         self._scanner = _GroupScanner(readers, groups, wanted, places)
         if isinstance(scene, BatchScene):
-            scene.px.stepper.scanners.append(self._scanner)
+            scene.px.stepper.add_scanner(self._scanner)
         if every_step:
             self._collector = _GroupScanner(readers, groups, wanted, places)
-            watch_contacts(scene, self._collector.take)
+            watch_contacts(scene, self._collector.take, self._collector.drop)
 
     def read(self) -> Contacts:
         """Contacts of the last physics step."""
@@ -197,6 +197,16 @@ class _GroupScanner(ContactScanner):
         self._point_slots: list[tuple[int, int]] = []
         self._point_impulses: list[np.ndarray] = []
         self._positions: list[np.ndarray] = []
+
+    def drop(self, environment: int) -> None:
+        """Drop the collected points of one environment."""
+        pairs = self._count**2
+        kept = [k for k, slot in enumerate(self._slots) if slot // pairs != environment]
+        for values in (self._slots, self._impulses, self._separations):
+            values[:] = [values[k] for k in kept]
+        kept = [k for k, (owner, _) in enumerate(self._point_slots) if owner != environment]
+        for values in (self._point_slots, self._point_impulses, self._positions):
+            values[:] = [values[k] for k in kept]
 
     def take(self, environment: int, contacts: list) -> None:
         """Collect the points between groups: index of (environment, first, second), impulse on first, separation."""
