@@ -11,7 +11,7 @@ import sapien
 import torch
 
 import dora
-from dora.errors import InputError
+from dora.errors import RECORDS, InputError
 from dora.sim.batch import guard, records
 from dora.sim.batch.actions import checked_action
 from dora.sim.batch.guard import marked
@@ -25,7 +25,7 @@ NAN3 = np.full(3, np.nan, np.float32)
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where the records go."""
-    monkeypatch.setenv(records.FOLDER, str(tmp_path / "nonfinite"))
+    monkeypatch.setenv(RECORDS, str(tmp_path / "nonfinite"))
     return tmp_path / "nonfinite"
 
 
@@ -86,7 +86,7 @@ def spoil(env: Any, kind: str) -> Any:
     observation, reward, terminated, _, info = step = env.step(zero(env))
     assert all_finite({"o": observation, "r": reward, "info": info}), kind
     assert info["nonfinite"].tolist() == [row == BAD for row in range(env.num_envs)], kind
-    assert terminated[BAD] and reward[BAD] == 0 and not info["success"][BAD], kind
+    assert (bool(terminated[BAD]), float(reward[BAD]), bool(info["success"][BAD])) == (True, 0.0, False), kind
     return step
 
 

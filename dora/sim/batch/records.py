@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from mani_skill import logger
 
-from dora.errors import InputError
+from dora.errors import RECORDS, InputError
 from dora.files import write_bytes
 from dora.sim.batch.packed import POSE_FLOATS, POSE_ORDER
 
-FOLDER = "DORA_NONFINITE"
-"""Environment variable with the folder of the files; by default `dora-nonfinite` among temporary files."""
+FOLDER = "dora-nonfinite"
+"""Name of the folder of the files among temporary files, unless the environment variable `RECORDS` names another."""
 MOST = 4
 """Files that one scene writes at most [1]."""
 MOST_IN_FOLDER = 16
@@ -77,7 +77,7 @@ class StateRecorder:
     def write(self, record: Record) -> None:
         """Write a record into the folder, as `<process>-<number>.npz`; what goes wrong is logged."""
         self._written += 1
-        folder = Path(os.environ.get(FOLDER) or Path(tempfile.gettempdir()) / "dora-nonfinite")
+        folder = Path(os.environ.get(RECORDS) or Path(tempfile.gettempdir()) / FOLDER)
         said = f"The simulation of environment {record.environment} is not finite or blew up: it was put back and its"
         try:
             folder.mkdir(parents=True, exist_ok=True)
