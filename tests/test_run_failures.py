@@ -215,6 +215,7 @@ def test_the_first_signal_asks_and_a_later_one_ends(capfd: pytest.CaptureFixture
         asked._since -= IMPATIENT
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
+        assert asked.at_once
     assert capfd.readouterr().err.count("Interrupted") == 1
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
@@ -227,6 +228,27 @@ def test_a_command_ends_quietly_while_it_is_imported(number: int, moment: float)
     assert line is not None
     assert end < 2 + moment
     assert "Traceback" not in said
+
+
+def test_what_is_half_learned_is_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A second signal comes in the middle of learning: the checkpoint before stays."""
+    folder = RunFolder(tmp_path)
+    folder.create(SHORT)
+    trainer = Trainer(SHORT, PointMass, folder)
+    trainer.save()
+    update, calls = trainer.learner.update, []
+
+    def half(batch: Any) -> Any:
+        calls.append(update(batch))
+        if len(calls) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(IMPATIENT + 0.1)
+            os.kill(os.getpid(), signal.SIGINT)
+        return calls[-1]
+
+    monkeypatch.setattr(trainer.learner, "update", half)
+    assert not trainer.run()["finished"]
+    assert read_checkpoint(folder.latest).progress["env_steps"] == 0
 
 
 def test_only_one_process_trains_in_a_folder(tmp_path: Path):

@@ -25,10 +25,12 @@ class Interrupt:
 
     Attributes:
         number: of the signal, None before.
+        at_once: whether there was a second one, which may have come at any place of the program.
     """
 
     def __init__(self) -> None:
         self.number: int | None = None
+        self.at_once = False
         self._since, self._before = 0.0, {}
 
     @property
@@ -48,6 +50,7 @@ class Interrupt:
             self.number, self._since = number, time.monotonic()
             _say(SAVING)
         elif time.monotonic() - self._since > IMPATIENT:
+            self.at_once = True
             raise KeyboardInterrupt
 
     def check(self) -> None:

@@ -144,7 +144,8 @@ class Trainer:
             try:
                 self._train(rollouts, log, progress, interrupt)
             except (KeyboardInterrupt, WorkerFailure) as error:
-                self.save()
+                if not interrupt.at_once:  # else perhaps in the middle of learning
+                    self.save()
                 if interrupt.requested and isinstance(error, WorkerFailure):
                     raise KeyboardInterrupt from None  # the same signal ended the worker
                 raise

@@ -1,5 +1,6 @@
 """Environments whose simulation is not finite or blows up: they are found, recorded and put back to a good state."""
 
+import copy
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -89,6 +90,7 @@ class StateGuard:
         """
         bad = self.check()
         good = ~self._bad() if bad.any() else ~bad  # an environment that was never good stays bad
+        action = action.clone() if isinstance(action, Tensor) else copy.copy(action)  # it may be changed later
         self._history.append(Moment(self._stepper.state.chunks(), self._stepper.poses.chunks(), action, good))
 
     def check(self) -> Bool[np.ndarray, " n"]:
