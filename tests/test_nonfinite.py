@@ -108,6 +108,20 @@ def test_a_bad_row_ends_and_its_reset_is_healthy(env_id: str):
     env.close()
 
 
+def test_a_bad_row_that_is_not_reset_goes_on_healthy():
+    env = make("PickCube-v1")
+    for _ in range(3):
+        env.step(zero(env))
+    for kind in SPOIL:
+        spoil(env, kind)
+        for _ in range(2):
+            observation, _, terminated, _, info = env.step(zero(env))
+            assert not info["nonfinite"].any(), kind
+            assert not terminated.any(), kind
+            assert observation.isfinite().all(), kind
+    env.close()
+
+
 @pytest.mark.parametrize("env_id", ["PickCube-v1", "DoraCube-v1", "DoraHammer-v1"])
 def test_the_other_rows_are_bit_identical(env_id: str):
     """Two equal batches, in one of which a row is spoilt again and again; contacts included."""
