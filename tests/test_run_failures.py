@@ -17,7 +17,6 @@ import pytest
 import torch
 from commands import call, load_command
 from fake_task import PointMass
-from tensordict import TensorDict
 from test_agents_train import BASE, SMALL_PPO, SMALL_SAC, children, run, weights
 from torch import Tensor
 
@@ -31,9 +30,9 @@ from dora.agents.runs.interrupt import IMPATIENT, Interrupt
 from dora.agents.runs.run_folder import RunFolder
 from dora.agents.runs.trainer import Trainer
 from dora.commands import run as run_command
+from dora.commands.interruptions import command, interrupt
 from dora.errors import InputError, RunFailure, WorkerFailure
 from dora.parallel import name_of_process
-from dora.tools.interruptions import command, interrupt
 
 SHORT = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=1536, eval_every=512, stagger=False)
 SHORT_SAC = dataclasses.replace(SHORT, agent="sac", learner=SMALL_SAC)
@@ -81,7 +80,8 @@ def test_a_row_that_is_not_finite_costs_one_episode(tmp_path: Path, config: Any,
 def test_a_row_that_is_not_finite_is_terminated_and_counted():
     task = Breaking(5, at=2, what="nan")
     env = TaskEnv(task, seed=0)
-    data, last = env.reset(), TensorDict({})
+    data: Any = env.reset()
+    last: Any = None
     for step in (1, 2):
         data["action"] = torch.zeros(5, 2)
         out, data = env.step_and_maybe_reset(data)

@@ -202,10 +202,12 @@ class _GroupScanner(ContactScanner):
         """Drop the collected points of one environment."""
         pairs = self._count**2
         kept = [k for k, slot in enumerate(self._slots) if slot // pairs != environment]
-        for values in (self._slots, self._impulses, self._separations):
+        lists: tuple[list[Any], ...] = (self._slots, self._impulses, self._separations)
+        for values in lists:
             values[:] = [values[k] for k in kept]
         kept = [k for k, (owner, _) in enumerate(self._point_slots) if owner != environment]
-        for values in (self._point_slots, self._point_impulses, self._positions):
+        lists = (self._point_slots, self._point_impulses, self._positions)
+        for values in lists:
             values[:] = [values[k] for k in kept]
 
     def take(self, environment: int, contacts: list) -> None:

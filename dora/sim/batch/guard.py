@@ -54,7 +54,8 @@ class StateGuard:
     def __init__(self, scenes: Sequence[sapien.Scene], stepper: Stepper):
         self.found = np.zeros(len(scenes), bool)
         self.recorder = StateRecorder()
-        self._scenes, self._systems = list(scenes), [scene.physx_system for scene in scenes]
+        self._scenes = list(scenes)
+        self._systems: list[Any] = [scene.physx_system for scene in scenes]
         self._stepper = stepper
         self._history: deque[Moment] = deque(maxlen=HISTORY)
         self._layout = Layout({}, {})

@@ -23,7 +23,7 @@ from sapien import physx
 
 from dora.errors import InputError
 from dora.sim.batch.actions import check_action, finite_rows
-from dora.sim.batch.guard import marked
+from dora.sim.batch.guard import StateGuard, marked
 from dora.sim.batch.rendering import can_render, replace_materials
 from dora.sim.batch.scene import BatchScene
 
@@ -161,7 +161,7 @@ def _step(original: Callable) -> Callable:
         """ManiSkill's step, in which environments whose state becomes bad are put back and terminated."""
         if not runs_batched(self):
             return original(self, action)
-        guard = self.scene.px.guard
+        guard: StateGuard = self.scene.px.guard  # pyright: ignore[reportAttributeAccessIssue]
         guard.begin(action)
         result, rows = marked(original(self, action), torch.from_numpy(guard.found))
         guard.clear()

@@ -1,7 +1,7 @@
 """Interrupts real training runs at chosen moments, and tells how they end and whether they go on.
 
-    python -m dora.tools.interruptions --moments 1 5 20 --signal TERM
-    python -m dora.tools.interruptions --moments 2 12 30 --signal KILL --group
+    python -m dora.commands.interruptions --moments 1 5 20 --signal TERM
+    python -m dora.commands.interruptions --moments 2 12 30 --signal KILL --group
 
 Prints one line per moment: seconds to the first line after the signal, seconds to the end, exit status, steps in the
 checkpoint, names left among shared memory and temporary files at the end and after the run was resumed, and what is
