@@ -202,13 +202,9 @@ class _GroupScanner(ContactScanner):
         """Drop the collected points of one environment."""
         pairs = self._count**2
         kept = [k for k, slot in enumerate(self._slots) if slot // pairs != environment]
-        lists: tuple[list[Any], ...] = (self._slots, self._impulses, self._separations)
-        for values in lists:
-            values[:] = [values[k] for k in kept]
+        _keep(kept, self._slots, self._impulses, self._separations)
         kept = [k for k, (owner, _) in enumerate(self._point_slots) if owner != environment]
-        lists = (self._point_slots, self._point_impulses, self._positions)
-        for values in lists:
-            values[:] = [values[k] for k in kept]
+        _keep(kept, self._point_slots, self._point_impulses, self._positions)
 
     def take(self, environment: int, contacts: list) -> None:
         """Collect the points between groups: index of (environment, first, second), impulse on first, separation."""
@@ -262,3 +258,9 @@ class _GroupScanner(ContactScanner):
         impulse = impulse - impulse.swapaxes(1, 2)
         separation = np.minimum(separation, separation.swapaxes(1, 2))
         return Contacts(torch.from_numpy(impulse), torch.from_numpy(separation))
+
+
+def _keep(kept: Sequence[int], *lists: list[Any]) -> None:
+    """Leaves in each list only the entries with these indices."""
+    for values in lists:
+        values[:] = [values[k] for k in kept]
