@@ -41,7 +41,13 @@ def as_tensor(value: Any, what: str, device: torch.device | str | None = None) -
     if value.is_complex():
         raise InputError(f"{what} must be real numbers, not complex ones.")
     value = value.detach().to(device)
-    return value.to(torch.float32) if value.dtype == torch.float64 else value
+    return _single(value) if value.dtype == torch.float64 else value
+
+
+def _single(value: Tensor) -> Tensor:
+    """Doubles as float32; finite ones that are too large become the largest one, not infinity."""
+    most = torch.finfo(torch.float32).max
+    return torch.where(value.isfinite(), value.clamp(-most, most), value).to(torch.float32)
 
 
 def _holds_tensors(value: Any) -> bool:

@@ -1,7 +1,10 @@
-"""The exception that Dora raises for input that a person can correct, and values as its messages show them."""
+"""The exceptions that Dora raises for what a person can correct and for runs that cannot go on, and values as messages
+show them."""
 
 import reprlib
 
+RECORDS = "DORA_NONFINITE"
+"""Environment variable with the folder for the last states of simulations that were not finite."""
 LONGEST = 1200
 """Characters of a message above which its middle is left out."""
 LONGEST_VALUE, DEEPEST_VALUE = 80, 3
@@ -27,3 +30,14 @@ def shown(value: object) -> str:
     short.maxstring = short.maxother = LONGEST_VALUE
     short.maxlevel = DEEPEST_VALUE
     return short.repr(value)
+
+
+class RunFailure(RuntimeError):
+    """A run cannot go on, but can be resumed: the message is one sentence that says why.
+
+    Scripts print it without a traceback, with the command that resumes, and end with exit status 1.
+    """
+
+
+class WorkerFailure(RunFailure):
+    """A worker process died, hangs, or raised something; this process is well."""

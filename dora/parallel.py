@@ -2,17 +2,34 @@
 
 import contextlib
 import functools
+import math
 import os
+import re
+import shutil
 import signal
+import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import Pipe, forkserver, get_all_start_methods, get_context, resource_tracker
+from multiprocessing import (
+    Pipe,
+    current_process,
+    forkserver,
+    get_all_start_methods,
+    get_context,
+    parent_process,
+    resource_tracker,
+)
 from multiprocessing.connection import Connection
+from multiprocessing.util import Finalize
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import torch
+
+from dora.errors import WorkerFailure
 
 Case = TypeVar("Case")
 Result = TypeVar("Result")
@@ -21,8 +38,14 @@ Progress = Callable[[int, int], None]
 
 CHUNK = 4
 """Cases that a process takes at once, where they are short."""
+PATIENCE = 600.0
+"""Time without any finished case after which the workers of an evaluation count as hung [s]."""
 POLL_SECONDS = 0.2
 """Longest time between two calls of `check` while workers are busy [s]."""
+SHARED = Path("/dev/shm")
+"""Where the system keeps semaphores by name."""
+LEFT = re.compile(r"(?:sem\.mp-)?dora-(?P<space>\d+)-(?P<process>\d+)-(?P<start>\d+)-.*")
+"""Name of a semaphore or temporary folder with the process that made it, see `name_of_process`."""
 DIED = "a worker process died (a crash in native code, or too little memory): run with one process to see why."
 """Message of the error after the death of a worker."""
 
@@ -46,8 +69,8 @@ def one_thread() -> Iterator[None]:
 class WorkerPool(Generic[Case, Result]):
     """A `ProcessPoolExecutor` whose processes each hold one task; a context manager.
 
-    Processes start when there are cases for them and stay until `close`. They do not see Ctrl-C, and end with this
-    process, also when that is killed.
+    Processes start when there are cases for them and stay until `close`. They see neither Ctrl-C nor SIGTERM, and end
+    with this process, also when that is killed.
 
     Args:
         factory: makes the task from `arguments`; called once per process, with the first case. Must be importable by
@@ -68,6 +91,7 @@ class WorkerPool(Generic[Case, Result]):
         progress: Progress = lambda done, total: None,
         check: Callable[[], None] = lambda: None,
         chunk: int = 1,
+        patience: float = math.inf,
     ) -> list[Result]:
         """Results of all cases, in their order; whatever is raised ends the processes.
 
@@ -77,9 +101,10 @@ class WorkerPool(Generic[Case, Result]):
             progress: told about cases that are done.
             check: called now and then while this process waits; may raise.
             chunk: cases that a process takes at once.
+            patience: longest time without a result of the other processes [s].
 
         Raises:
-            RuntimeError: a process died.
+            WorkerFailure: a process died, or all hang.
             Exception: what the task raised first.
         """
         parts = [range(start, min(start + chunk, len(cases))) for start in range(0, len(cases), chunk)]
@@ -96,13 +121,17 @@ class WorkerPool(Generic[Case, Result]):
             pending = {self._submit([cases[i] for i in part]): part for part in others}
             for part in own:
                 add(part, [here(cases[i]) for i in part])  # pyright: ignore[reportOptionalCall]
+            last = time.monotonic()
             while pending:
                 for future in wait(pending, POLL_SECONDS, FIRST_COMPLETED).done:
                     add(pending.pop(future), future.result())
+                    last = time.monotonic()
                 check()
+                if time.monotonic() - last > patience:
+                    raise WorkerFailure(f"The worker processes hang: none has finished anything for {patience:.0f} s.")
         except BrokenProcessPool as error:
             self.close()
-            raise RuntimeError(DIED) from error
+            raise WorkerFailure(DIED) from error
         except BaseException:
             self.close()
             raise
@@ -112,6 +141,8 @@ class WorkerPool(Generic[Case, Result]):
         """End the processes, whatever they are doing; `map` may start new ones."""
         if self._executor is not None and self._alive is not None:
             self._alive.close()
+            for process in list((self._executor._processes or {}).values()):
+                process.kill()  # also those that hang
             self._executor.shutdown(cancel_futures=True)
             self._executor = None
 
@@ -122,7 +153,7 @@ class WorkerPool(Generic[Case, Result]):
         self.close()
 
     def _submit(self, cases: list[Case]) -> Future[list[Result]]:
-        with sigint_blocked():
+        with signals_blocked():
             if self._executor is None:
                 theirs, self._alive = Pipe(duplex=False)
                 context = _context(self._task.func.__module__)
@@ -151,6 +182,58 @@ def run_cases(
         return pool.map(cases, progress=report, chunk=chunk)
 
 
+def name_of_process() -> str:
+    """Beginning of the names of temporary folders of this process: they can be recognised when it is gone.
+
+    It has the process's namespace, its number, and its start in ticks of the system's clock.
+    """
+    return f"dora-{_namespace()}-{os.getpid()}-{_start(os.getpid())}-"
+
+
+@functools.cache
+def name_leftovers() -> None:
+    """Name the semaphores and temporary folders of worker processes after this process, and remove those that
+    processes of the same user left, which are gone; Python removes its own unless it is killed with all its processes.
+    """
+    if parent_process() is not None:
+        return  # a worker uses the names of the process that started it
+    settings: dict[str, str] = current_process()._config  # pyright: ignore[reportAttributeAccessIssue]
+    settings["semprefix"] = f"/mp-{name_of_process().rstrip('-')}"
+    settings["tempdir"] = folder = tempfile.mkdtemp(prefix=name_of_process())
+    Finalize(None, shutil.rmtree, (folder,), {"ignore_errors": True}, exitpriority=-100)
+    for place in (SHARED, Path(tempfile.gettempdir())):
+        for path in place.glob("*dora-*-*"):
+            if _is_left(path):
+                shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def _is_left(path: Path) -> bool:
+    """Whether a file was made by a process of this user that is gone; False for what may belong to anything else."""
+    found = LEFT.fullmatch(path.name)
+    try:
+        if found is None or int(found["space"]) != _namespace() or path.stat().st_uid != os.getuid():
+            return False
+        return _start(int(found["process"])) != int(found["start"])
+    except OSError:
+        return False
+
+
+def _namespace() -> int:
+    """The namespace of process numbers; 0 where the system does not tell."""
+    try:
+        return os.stat("/proc/self/ns/pid").st_ino
+    except OSError:
+        return 0
+
+
+def _start(process: int) -> int:
+    """When a process started, in ticks since the system did; 0 if it is gone, or where the system does not tell."""
+    try:
+        return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[19])
+    except (OSError, IndexError):
+        return 0
+
+
 def warm_up(factory: Callable[..., Any]) -> None:
     """Begin to import, beside other work, what worker processes with this factory will need; returns at once."""
     if available_cores() > 1:
@@ -158,10 +241,11 @@ def warm_up(factory: Callable[..., Any]) -> None:
 
 
 @contextlib.contextmanager
-def sigint_blocked() -> Iterator[None]:
-    """Block Ctrl-C while processes start: they keep the mask for good, this process gets the signal later."""
-    resource_tracker.ensure_running()  # unblocks SIGINT itself when it starts
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+def signals_blocked() -> Iterator[None]:
+    """Block Ctrl-C and SIGTERM while processes start: they keep the mask for good, this process gets them later."""
+    name_leftovers()
+    resource_tracker.ensure_running()  # unblocks both itself when it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
     finally:
@@ -177,7 +261,7 @@ def _context(module: str) -> Any:
         return get_context("spawn")
     context = get_context("forkserver")
     context.set_forkserver_preload(["dora", module])
-    with sigint_blocked():
+    with signals_blocked():
         forkserver.ensure_running()
     return context
 

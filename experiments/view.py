@@ -2,7 +2,9 @@
 
 import sys
 
-from dora.commands.view import main
-
 if __name__ == "__main__":
-    sys.exit(main())
+    from quiet_start import call  # before what takes seconds to import
+
+    from dora.commands.view import main
+
+    sys.exit(call(main))

@@ -29,9 +29,9 @@ def make(env_id: str, backend: str, num_envs: int = 1, **kwargs) -> Any:
 
 
 def numbers(value) -> list[np.ndarray]:
-    """All arrays in nested dictionaries and tuples, as float32 or what they are, in order."""
+    """All arrays in nested dictionaries and tuples, as float32 or what they are, in order; stock has no `nonfinite`."""
     if isinstance(value, dict):
-        return [array for key in sorted(value) for array in numbers(value[key])]
+        return [array for key in sorted(set(value) - {"nonfinite"}) for array in numbers(value[key])]
     if isinstance(value, tuple | list):
         return [array for part in value for array in numbers(part)]
     return [np.asarray(value)]

@@ -28,11 +28,12 @@ from dora.agents.config import LEARNER_CONFIGS, Agent, Numbers, RunConfig, Setti
 from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed, outcome
 from dora.agents.evaluation.play import checkpoint_path, evaluate_checkpoint, evaluate_zero, load_policy, record
 from dora.agents.limits import check
+from dora.agents.runs.interrupt import STATUS, ending_at_once
 from dora.agents.runs.recommended import recommended
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.agents.runs.trainer import Trainer
 from dora.configs import plain
-from dora.errors import InputError
+from dora.errors import InputError, RunFailure
 from dora.tasks import find_task, make_task
 from dora.tasks.env.options import task_config
 from dora.tasks.mdp.guidance_parts import guidance_in_force
@@ -41,8 +42,8 @@ from dora.tools.arguments import early_value, early_values
 
 VIDEO_EPISODES = 3
 """Episodes of a film [1]."""
-INTERRUPTED = 130
-"""Exit status after Ctrl-C."""
+FAILED = 1
+"""Exit status of a run that cannot go on but can be resumed."""
 BAD_INPUT = 2
 """Exit status after input that a person can mend."""
 ZERO = "zero"
@@ -167,24 +168,33 @@ def task_maker(config: RunConfig) -> Any:
     return functools.partial(make_task, config.env, **config.task_options)
 
 
-def train(args: Args) -> tuple[Path, bool]:
-    """Start or resume a run; returns its folder and whether it finished."""
+def train(args: Args) -> tuple[Path, int]:
+    """Start or resume a run; returns its folder and the exit status.
+
+    Raises:
+        InputError: if another process trains in the folder, or settings differ.
+    """
     config = args.run
+    folder = RunFolder(args.resume or args.out or default_folder(config, config.agent))
     if args.resume is not None:
-        folder = RunFolder(args.resume)
         refuse_other_settings(args.resume, folder.read_config(), config)
-        folder.write_config(config)
     else:
-        folder = RunFolder(args.out or default_folder(config, config.agent))
         folder.create(config)
-    trainer = Trainer(config, task_maker(config), folder, resume=args.resume is not None, zero=args.zero_correction)
-    result = trainer.run()
-    if not result["finished"]:
-        command = ["python", *sys.argv[:1], "--resume", str(folder.path)]
-        print(f"Interrupted and saved. To go on: {shlex.join(command)}", file=sys.stderr)
-    elif args.video:
+    with folder.locked():
+        folder.write_config(config)
+        trainer = Trainer(config, task_maker(config), folder, resume=args.resume is not None, zero=args.zero_correction)
+        go_on = "To go on: " + shlex.join(["python", *sys.argv[:1], "--resume", str(folder.path)])
+        try:
+            trainer.run()
+        except RunFailure as error:
+            print(f"{error} {go_on}", file=sys.stderr)
+            return folder.path, FAILED
+        if trainer.interrupted is not None:
+            print(f"Interrupted and saved. {go_on}", file=sys.stderr)
+            return folder.path, STATUS + trainer.interrupted
+    if args.video:
         film(folder.best, config, folder.video / "best.mp4")
-    return folder.path, result["finished"]
+    return folder.path, 0
 
 
 def evaluate_only(args: Args) -> Path:
@@ -233,15 +243,14 @@ def main() -> int:
     """Run the command; returns the exit status."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     try:
-        args = parse(sys.argv[1:])
-        if args.eval_only:
-            folder, finished = evaluate_only(args), True
-        else:
-            folder, finished = train(args)
+        with ending_at_once():
+            args = parse(sys.argv[1:])
+            folder, status = (evaluate_only(args), 0) if args.eval_only else train(args)
     except InputError as error:
         print(error, file=sys.stderr)
         return BAD_INPUT
-    except KeyboardInterrupt:
-        return INTERRUPTED
+    except RunFailure as error:
+        print(error, file=sys.stderr)
+        return FAILED
     print(folder)
-    return 0 if finished else INTERRUPTED
+    return status

@@ -75,10 +75,10 @@ class ContactMonitor:
             readers = [scene.px.get_contacts]
         self._scanner = _GroupScanner(readers, groups, wanted, places)
         if isinstance(scene, BatchScene):
-            scene.px.stepper.scanners.append(self._scanner)
+            scene.px.stepper.add_scanner(self._scanner)
         if every_step:
             self._collector = _GroupScanner(readers, groups, wanted, places)
-            watch_contacts(scene, self._collector.take)
+            watch_contacts(scene, self._collector.take, self._collector.drop)
 
     def read(self) -> Contacts:
         """Contacts of the last physics step."""
@@ -198,6 +198,14 @@ class _GroupScanner(ContactScanner):
         self._point_impulses: list[np.ndarray] = []
         self._positions: list[np.ndarray] = []
 
+    def drop(self, environment: int) -> None:
+        """Drop the collected points of one environment."""
+        pairs = self._count**2
+        kept = [k for k, slot in enumerate(self._slots) if slot // pairs != environment]
+        _keep(kept, self._slots, self._impulses, self._separations)
+        kept = [k for k, (owner, _) in enumerate(self._point_slots) if owner != environment]
+        _keep(kept, self._point_slots, self._point_impulses, self._positions)
+
     def take(self, environment: int, contacts: list) -> None:
         """Collect the points between groups: index of (environment, first, second), impulse on first, separation."""
         group_of, count, wanted = self._group_of.get, self._count, self._wanted
@@ -250,3 +258,9 @@ class _GroupScanner(ContactScanner):
         impulse = impulse - impulse.swapaxes(1, 2)
         separation = np.minimum(separation, separation.swapaxes(1, 2))
         return Contacts(torch.from_numpy(impulse), torch.from_numpy(separation))
+
+
+def _keep(kept: Sequence[int], *lists: list[Any]) -> None:
+    """Leaves in each list only the entries with these indices."""
+    for values in lists:
+        values[:] = [values[k] for k in kept]

@@ -32,7 +32,7 @@ class OverlapMonitor:
         self._names: list[tuple[str, str] | None] = [None] * self._count
         self._lowest = [0.0] * self._count
         if self.known:
-            watch_contacts(scene, self._watch)
+            watch_contacts(scene, self._watch, self._drop)
 
     def _watch(self, environment: int, contacts: list) -> None:
         lowest = self._lowest[environment]
@@ -43,6 +43,9 @@ class OverlapMonitor:
                 if id(one) in self._watched or id(other) in self._watched:
                     self._lowest[environment] = lowest = separation
                     self._names[environment] = (one.entity.name, other.entity.name)
+
+    def _drop(self, environment: int) -> None:
+        self._lowest[environment], self._names[environment] = 0.0, None
 
     def take(self) -> Float[Tensor, " n"]:
         """Largest overlap in the physics steps since the last `take` [m], 0 without any; NaN where `known` is False."""

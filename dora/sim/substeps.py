@@ -28,16 +28,22 @@ def watch_physics(scene: ManiSkillScene, watch: Callable[[int], None]) -> None:
     scene.step = step_and_watch
 
 
-def watch_contacts(scene: ManiSkillScene, watch: Callable[[int, list], None]) -> None:
+def watch_contacts(
+    scene: ManiSkillScene, watch: Callable[[int, list], None], drop: Callable[[int], None] | None = None
+) -> None:
     """Registers a function that is shown the contacts of each physics step of each environment.
 
     Args:
         scene: as for `watch_physics`.
         watch: called with the index of the environment and SAPIEN's contacts, which it must not keep: SAPIEN frees
             them in the next step. The contacts are those of the poses before the step; their impulses are the step's.
+        drop: called with the index of an environment whose last contacts do not count, because its simulation became
+            bad and was put back.
     """
     if isinstance(scene, BatchScene):
         scene.px.stepper.contact_watchers.append(watch)
+        if drop is not None:
+            scene.px.stepper.droppers.append(drop)
     else:
         system: Any = scene.px
         watch_physics(scene, lambda environment: watch(environment, system.get_contacts()))

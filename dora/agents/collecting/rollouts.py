@@ -3,12 +3,16 @@
 import copy
 import functools
 import os
+import signal
 import tempfile
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
+from multiprocessing import active_children
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -16,11 +20,16 @@ from torchrl.collectors import Collector, MultiSyncCollector
 
 from dora.agents.collecting.task_env import Task, TaskEnv, TaskFactory
 from dora.agents.learners.networks import Policy
-from dora.errors import InputError
-from dora.parallel import sigint_blocked
+from dora.errors import InputError, RunFailure, WorkerFailure
+from dora.parallel import name_leftovers, name_of_process, signals_blocked
 
+Result = TypeVar("Result")
 SHUTDOWN_SECONDS = 10.0
 """Workers that have not ended after this time are killed [s]."""
+POLL_SECONDS = 0.2
+"""Longest time between two calls of `check` while workers collect [s]."""
+PATIENCE = 180.0
+"""Time without a batch after which workers count as hung [s]."""
 LESS_URGENT = 5
 """Niceness of workers that collect while the learner is busy: the learner has priority."""
 
@@ -75,6 +84,11 @@ class Rollouts:
         ahead: workers go on with the next batch while the caller learns from this one, so that all cores are busy;
             a batch then comes from the policy as it was one call of `collect` earlier. Without workers it changes
             nothing.
+        check: called now and then while workers start; may raise.
+
+    Raises:
+        InputError: with the message of a worker that raised one.
+        WorkerFailure: if a worker failed otherwise or died.
     """
 
     def __init__(
@@ -88,13 +102,16 @@ class Rollouts:
         seeds: Sequence[int],
         stagger: bool,
         ahead: bool = False,
+        check: Callable[[], None] = lambda: None,
     ):
         self._policy = policy
         self._acting = copy.deepcopy(policy) if workers > 0 else policy  # the workers share its memory
-        self._waiting = ThreadPoolExecutor(1) if ahead and workers > 0 else None
+        self._ahead = ahead
         self._next: Future[TensorDictBase] | None = None
-        self._scratch = tempfile.TemporaryDirectory(prefix="dora-workers-")
+        name_leftovers()
+        self._scratch = tempfile.TemporaryDirectory(prefix=name_of_process())
         self._reports = [Path(self._scratch.name) / str(i) for i in range(max(workers, 1))]
+        self._processes: Sequence[Any] = ()
         if workers == 0:
             env = TaskEnv(make_task(), seed=seeds[0], stagger=stagger)
             self._collector = Collector(
@@ -110,8 +127,9 @@ class Rollouts:
                 functools.partial(_make_worker_env, make_task, report, seed, stagger, LESS_URGENT if ahead else 0)
                 for report, seed in zip(self._reports, seeds, strict=True)
             ]
-            with sigint_blocked(), self._explained():
-                self._collector = MultiSyncCollector(
+            self._collector = self._started(
+                functools.partial(
+                    MultiSyncCollector,
                     factories,
                     self._acting,
                     frames_per_batch=workers * num_envs * rollout,
@@ -122,58 +140,126 @@ class Rollouts:
                     num_sub_threads=1,
                     trust_policy=True,
                     auto_register_policy_transforms=False,
-                )
+                ),
+                check,
+            )
+            self._processes = self._collector.procs
         self._iterator = iter(self._collector)
 
-    def collect(self) -> TensorDictBase:
+    def _started(self, make: Callable[[], MultiSyncCollector], check: Callable[[], None]) -> MultiSyncCollector:
+        """The collector of worker processes, made in a thread that blocks signals for them, while this one does not."""
+
+        def make_quietly() -> MultiSyncCollector:
+            with signals_blocked():
+                return make()
+
+        before = set(active_children())
+        with self._explained():
+            future = _in_thread(make_quietly)
+            try:
+                while not wait([future], POLL_SECONDS).done:
+                    check()
+                return future.result()
+            except BaseException:
+                self._processes = list(set(active_children()) - before)
+                end = time.monotonic() + SHUTDOWN_SECONDS
+                while not future.done() and time.monotonic() < end:  # it may be about to start another one
+                    _kill(set(active_children()) - before)
+                    wait([future], POLL_SECONDS)
+                _kill(set(active_children()) - before)
+                self._scratch.cleanup()
+                raise
+
+    def collect(self, check: Callable[[], None] = lambda: None) -> TensorDictBase:
         """The next batch; its memory is reused by the following call.
+
+        Args:
+            check: called now and then while workers collect; may raise.
 
         Raises:
             InputError: with the message of a worker that raised one.
-            RuntimeError: if a worker failed otherwise.
+            WorkerFailure: if a worker failed otherwise, died, or hangs.
         """
+        if not self._processes:
+            return next(self._iterator)
         with self._explained():
-            if self._waiting is None:
-                self._push()
-                return next(self._iterator)
-            batch = (self._next or self._begin(self._waiting)).result().clone()
-            self._next = self._begin(self._waiting)
+            future = self._next or self._begin()
+            self._next = future  # still under way if the wait is interrupted
+            start = time.monotonic()
+            while not wait([future], POLL_SECONDS).done:
+                check()
+                if time.monotonic() - start > PATIENCE:
+                    raise WorkerFailure(f"The workers hang: they have collected nothing for {PATIENCE:.0f} s.")
+            self._next, batch = None, future.result()
+            if self._ahead:
+                batch = batch.clone()
+                self._next = self._begin()
             return batch
 
-    def _begin(self, waiting: ThreadPoolExecutor) -> Future[TensorDictBase]:
-        """Start a batch with the present policy; a thread waits for it."""
-        self._push()
-        return waiting.submit(next, self._iterator)
+    def _begin(self) -> "Future[TensorDictBase]":
+        """Start a batch with the present policy; a thread waits for it, which does not keep the process alive."""
+        self._acting.load_state_dict(self._policy.state_dict())
+        self._collector.update_policy_weights_()
+        return _in_thread(functools.partial(next, self._iterator))
 
-    def _push(self) -> None:
-        """Give the workers the present weights and normaliser of the policy."""
-        if isinstance(self._collector, MultiSyncCollector):
-            self._acting.load_state_dict(self._policy.state_dict())
-            self._collector.update_policy_weights_()
-
-    def close(self) -> None:
-        """End the workers."""
-        if self._waiting is not None:
-            self._waiting.shutdown()  # the batch that is under way
-        self._collector.shutdown(timeout=SHUTDOWN_SECONDS)
+    def close(self, at_once: bool = False) -> None:
+        """End the workers; `at_once` without waiting for what they are doing."""
+        if at_once:
+            _kill(self._processes)
+        if self._next is not None:
+            wait([self._next], SHUTDOWN_SECONDS)  # the batch that is under way
+        self._collector.shutdown(timeout=SHUTDOWN_SECONDS, raise_on_error=not at_once)
         self._scratch.cleanup()
 
     def __enter__(self) -> "Rollouts":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(self, kind: object, *_: object) -> None:
+        self.close(at_once=kind is not None)
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
-        """Replace TorchRL's "a process failed" by what the worker said."""
+        """Replace TorchRL's "a process failed" by what the worker said, or by how it ended."""
         try:
             yield
+        except (RunFailure, InputError):
+            raise
         except Exception as error:
             for index, report in enumerate(self._reports):
                 if report.exists():
                     kind, _, message = report.read_text().partition("\n")
                     if kind == "InputError":
                         raise InputError(message) from None
-                    raise RuntimeError(f"worker {index} failed with {kind}: {message}") from error
+                    raise WorkerFailure(f"worker {index} failed with {kind}: {message}") from error
+            ended = [f"{k} ({_how(p.exitcode)})" for k, p in enumerate(self._processes) if not p.is_alive()]
+            if ended or isinstance(error, EOFError):
+                raise WorkerFailure(f"A worker process died: worker {', '.join(ended)}.") from error
             raise
+
+
+def _in_thread(function: "Callable[[], Result]") -> "Future[Result]":
+    """The result of a function that a thread calls, which does not keep the process alive."""
+    future: Future[Result] = Future()
+
+    def call() -> None:
+        try:
+            future.set_result(function())
+        except BaseException as error:  # whoever waits for the result raises it
+            future.set_exception(error)
+
+    threading.Thread(target=call, daemon=True).start()
+    return future
+
+
+def _kill(processes: Iterable[Any]) -> None:
+    """End processes at once, also those that hang."""
+    for process in processes:
+        if process.is_alive():
+            process.kill()
+
+
+def _how(status: int | None) -> str:
+    """How a process with this exit status ended."""
+    if status is not None and status < 0:
+        return f"ended by {signal.Signals(-status).name}"
+    return f"exit status {status}"

@@ -21,8 +21,8 @@ class Task(Protocol):
     optionally `fail` (N,) bool (the episode cannot go on) and every name of `logged`, each (N,).
     Success does not end an episode: it runs to `max_steps` unless it fails. Evaluation understands, if they are
     logged, `raw_success` (success without regard to overlap), `success_at_end` (success, and what was reached still
-    holds now), `penetration_mm` and `nonfinite` (the simulator gave NaN or infinity). A task may have an attribute
-    `ranking_steps`: simulated steps that ranking its candidates took.
+    holds now), `penetration_mm` and `nonfinite` (the simulator gave NaN or infinity; such an episode ends). A task may
+    have an attribute `ranking_steps`: simulated steps that ranking its candidates took.
     """
 
     @property
@@ -75,6 +75,8 @@ class Task(Protocol):
         ...
 
 
+NONFINITE = "nonfinite"
+"""Name of the column that says in which episodes something was not finite."""
 TaskFactory = Callable[[], Task]
 """Makes a task; must be picklable, because worker processes call it."""
 MakeTask = Callable[[int], Task]
@@ -126,6 +128,9 @@ class TaskEnv(EnvBase):
     bootstraps from the last observation of every other episode. Actions are clipped to the action space.
     ("next", "statistics") (N, K) holds what `EpisodeColumns` names, of the episode up to this step.
 
+    A row that the task reports as `nonfinite`, or whose observation or reward is NaN or infinite, is terminated and
+    counted in the column `nonfinite`; it is no success, earns 0, and what is not finite is replaced by 0.
+
     Args:
         task: the batch to step; closed with this environment.
         seed: seed of the first reset; later resets go on from it.
@@ -137,7 +142,7 @@ class TaskEnv(EnvBase):
         super().__init__(device=task.device, batch_size=torch.Size([task.num_envs]))
         self.task = task
         self._pending_seed: int | list[int] | None = seed
-        self.columns = EpisodeColumns.of(task.logged)
+        self.columns = EpisodeColumns.of(tuple(dict.fromkeys((*task.logged, NONFINITE))))
         self._limit = torch.full((task.num_envs,), task.max_steps, device=task.device)
         if stagger:
             generator = torch.Generator().manual_seed(0 if seed is None else seed)
@@ -146,6 +151,7 @@ class TaskEnv(EnvBase):
         self._last, self._highest, self._total = self._statistics.split(
             [len(self.columns.last), len(self.columns.highest), len(self.columns.total)], dim=1
         )
+        self._not_success = torch.tensor([float(name == "whole") for name in self.columns.last], device=task.device)
         self._low = torch.as_tensor(task.single_action_space.low, device=task.device)
         self._high = torch.as_tensor(task.single_action_space.high, device=task.device)
         self._set_specs(task.reset(seed=seed)[0])
@@ -196,7 +202,7 @@ class TaskEnv(EnvBase):
         no = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         return TensorDict(
             {
-                "observation": observation.clone(),
+                "observation": _zeroed(observation, None),
                 "statistics": self._statistics.clone(),
                 "done": no,
                 "terminated": no.clone(),
@@ -212,7 +218,13 @@ class TaskEnv(EnvBase):
         fail = info.get("fail")
         truncated = self.task.elapsed_steps >= self._limit
         terminated = torch.zeros_like(truncated) if fail is None else fail.to(torch.bool).reshape(-1)
-        self._count(reward, info)
+        bad = _bad_rows(observation, reward, info)
+        if bad.any():
+            observation, reward = _zeroed(observation, bad), torch.where(bad, torch.zeros_like(reward), reward)
+            terminated, truncated = terminated | bad, truncated & ~bad
+        self._count(reward, info | {NONFINITE: bad})
+        if bad.any():
+            self._last[bad] = self._last[bad] * self._not_success
         return TensorDict(
             {
                 "observation": observation.clone(),
@@ -235,6 +247,7 @@ class TaskEnv(EnvBase):
             "length": one,
         }
         values = torch.stack([given[name].reshape(-1).float() for name in self.columns.names], 1)
+        values = values.nan_to_num(0.0, 0.0, 0.0)
         last, highest, total = values.split([self._last.shape[1], self._highest.shape[1], self._total.shape[1]], dim=1)
         self._last.copy_(last)
         torch.maximum(self._highest, highest, out=self._highest)
@@ -254,6 +267,18 @@ class TaskEnv(EnvBase):
         if not self.is_closed:
             self.task.close()
         super().close(raise_if_closed=raise_if_closed)
+
+
+def _bad_rows(observation: Tensor, reward: Tensor, info: dict[str, Any]) -> Bool[Tensor, " n"]:
+    """Rows of a step in which something is not finite, by its numbers or by what the task says."""
+    bad = ~(observation.isfinite().all(-1) & reward.reshape(-1).isfinite())
+    return bad | info[NONFINITE].bool().reshape(-1) if NONFINITE in info else bad
+
+
+def _zeroed(observation: Float[Tensor, "n o"], rows: Bool[Tensor, " n"] | None) -> Float[Tensor, "n o"]:
+    """A copy with 0 for NaN and infinity, in some rows or all."""
+    finite = observation.nan_to_num(0.0, 0.0, 0.0)
+    return finite if rows is None else torch.where(rows[:, None], finite, observation)
 
 
 def ended_episodes(

@@ -13,7 +13,7 @@ from dora.agents.config import RunConfig
 from dora.agents.evaluation.evaluate import FINAL_SEED, Act, Evaluation, no_correction, run_batch
 from dora.agents.learners.learner import make_learner
 from dora.agents.learners.networks import Policy
-from dora.parallel import WorkerPool
+from dora.parallel import PATIENCE, WorkerPool
 
 FEWEST = 2
 """Environments of the smallest batch [1]: sums over a single one are rounded in another order."""
@@ -54,13 +54,13 @@ class Evaluators:
             check: called every control step; what it raises ends the evaluation, and the helpers.
 
         Raises:
-            RuntimeError: a helper process died.
+            WorkerFailure: a helper process died or hangs.
             Exception: what a task raised first, here or in a helper.
         """
         weights = None if policy is None else {k: v.numpy(force=True) for k, v in policy.state_dict().items()}
         size = self._config.eval_envs
         batches = [(weights, first_seed + start, min(size, episodes - start)) for start in range(0, episodes, size)]
-        tables = self._helpers.map(batches, functools.partial(self._own, check=check), check=check)
+        tables = self._helpers.map(batches, functools.partial(self._own, check=check), check=check, patience=PATIENCE)
         table = torch.from_numpy(np.concatenate(tables))
         return Evaluation(self.env.columns, table, first_seed, getattr(self.env.task, "ranking_steps", None))
 

@@ -10,6 +10,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from dora.agents.config import PPOConfig
+from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, GaussianActor, Normaliser, Policy, for_loss
 
 ADAM_EPSILON = 1e-8
@@ -145,10 +146,13 @@ class PPO:
         out = self.loss(minibatch)
         bound = (self._mean.abs() - 1).clamp_min(0).square().sum(-1).mean()
         total = out["loss_objective"] + out["loss_entropy"] + out["loss_critic"] + self.config.bound * bound
+        check_loss("loss", total)
         self.optimiser.zero_grad()
         total.backward()
         norm = nn.utils.clip_grad_norm_(self.actor.parameters(), self.config.grad_norm)
-        nn.utils.clip_grad_norm_(self.critic.parameters(), self.config.grad_norm)
+        critic_norm = nn.utils.clip_grad_norm_(self.critic.parameters(), self.config.grad_norm)
+        check_loss("gradient of the actor", norm)
+        check_loss("gradient of the critic", critic_norm)
         self.optimiser.step()
         with torch.no_grad():
             self.actor.log_std.clamp_(self.config.log_std_min, 0.0)

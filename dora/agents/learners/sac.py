@@ -11,6 +11,7 @@ from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
 from dora.agents.config import SACConfig
+from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, Normaliser, Policy, TanhActor, for_loss
 from dora.agents.learners.replay import Replay
 
@@ -108,7 +109,7 @@ class SAC:
 
     def _learn_critic(self, sample: TensorDict) -> Tensor:
         loss, _ = self.loss.qvalue_v2_loss(sample)
-        _descend(self.optimisers["critic_adam"], loss)
+        _descend(self.optimisers["critic_adam"], loss, "loss of the critics")
         return loss.detach()
 
     def _alpha(self) -> Tensor:
@@ -118,10 +119,11 @@ class SAC:
     def _learn_actor(self, sample: TensorDict) -> Tensor:
         loss, metadata = self.loss.actor_loss(sample)
         mean, std = self.actor(sample["features"])
-        _descend(self.optimisers["actor_adam"], loss + self.config.prior * mean.square().sum(-1).mean())
+        total = loss + self.config.prior * mean.square().sum(-1).mean()
+        _descend(self.optimisers["actor_adam"], total, "loss of the actor")
         log_prob = metadata["log_prob"]
         alpha_loss = self.loss.alpha_loss(log_prob).mean()
-        _descend(self.optimisers["alpha_adam"], alpha_loss)
+        _descend(self.optimisers["alpha_adam"], alpha_loss, "loss of the temperature")
         size = mean.detach().tanh().square().mean().sqrt()
         return torch.stack([loss.detach(), self._alpha(), -log_prob.mean(), std.detach().mean(), size])
 
@@ -161,7 +163,8 @@ def _leaves(parameters: Any) -> list[Any]:
     return list(parameters.values(include_nested=True, leaves_only=True))
 
 
-def _descend(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
+def _descend(optimiser: torch.optim.Optimizer, loss: Tensor, name: str) -> None:
+    check_loss(name, loss)
     optimiser.zero_grad()
     loss.backward()
     optimiser.step()

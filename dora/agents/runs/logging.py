@@ -20,6 +20,7 @@ TAGS: dict[str, str] = {
     "episode/reward/<term>": "mean per control step of the reward term over those episodes, weight included",
     "episode/stage/<name>": "share of those episodes that reached the stage",
     "episode/penetration_mm": "mean over those episodes of their largest penetration [mm]",
+    "episode/nonfinite": "share of those episodes that ended because their simulation was not finite",
     "episode/<other>": "mean per control step of any other value that the task logs",
     "loss/policy": "PPO: clipped surrogate objective, negative",
     "loss/value": "PPO: squared error of the value times its weight",

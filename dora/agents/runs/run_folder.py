@@ -1,9 +1,14 @@
 """The folder of a run: what is where, and what `result.json` contains."""
 
+import contextlib
 import dataclasses
+import fcntl
 import importlib.metadata
+import json
 import os
 import platform
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +37,8 @@ CURVE_HEADER = (
     "training_success_rate",
 )
 """Columns of a learning curve."""
+HALF_WRITTEN = re.compile(r"\..+\.\w{8}")
+"""Name of a file that was being written when its process was killed, see `dora.files.write_bytes`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +47,8 @@ class RunFolder:
 
     `config.yaml`, `versions.txt`, TensorBoard events, `checkpoints/{latest,best}.safetensors`,
     `checkpoints/replay/` (SAC), `progress.csv` (one row per iteration), `curve.csv` (one row per evaluation),
-    `eval.csv` (one row per episode of the last evaluation), `result.json`, `video/`.
+    `eval.csv` (one row per episode of the last evaluation), `result.json`, `video/`, `nonfinite/` (last states of
+    simulations that were not finite), `.lock`.
     """
 
     path: Path
@@ -69,6 +77,11 @@ class RunFolder:
     def progress(self) -> Path:
         """Table of the iterations of training."""
         return self.path / "progress.csv"
+
+    @property
+    def nonfinite(self) -> Path:
+        """Folder of the last states of simulations that were not finite."""
+        return self.path / "nonfinite"
 
     @property
     def video(self) -> Path:
@@ -109,6 +122,44 @@ class RunFolder:
             ) from error
         self.write_config(config)
         write_bytes(self.path / "versions.txt", _versions().encode())
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """A context in which no other process trains in this folder; removes what a killed one left half written.
+
+        The system drops the lock with the process, however that ends.
+
+        Raises:
+            InputError: if another process has it, or the folder cannot be written.
+        """
+        try:
+            descriptor = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise InputError(f"Cannot write in {self.path} ({error.strerror}): make the folder writable.") from error
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise InputError(
+                    f"Another process is training in {self.path}: wait until it ends, or choose another --out."
+                ) from error
+            for place in (self.path, self.checkpoints, self.replay):
+                for path in place.glob(".*"):
+                    if HALF_WRITTEN.fullmatch(path.name) and path.is_file():
+                        path.unlink(missing_ok=True)
+            yield
+        finally:
+            os.close(descriptor)
+
+    def mark_unfinished(self) -> None:
+        """Let an earlier `result.json` say that the run is not finished, because it goes on."""
+        path = self.path / "result.json"
+        try:
+            result = json.loads(path.read_text())
+        except (OSError, ValueError):
+            return
+        if isinstance(result, dict) and result.get("finished"):
+            self.write_result(result | {"finished": False})
 
     def write_config(self, config: RunConfig) -> None:
         """Write `config.yaml`."""
@@ -153,8 +204,10 @@ def make_result(
     zero: Evaluation | None,
     curve: list[list[Any]],
     finished: bool,
+    nonfinite: int = 0,
 ) -> dict[str, Any]:
-    """Content of `result.json`; rates are null where nothing was evaluated. `curve` has the rows of `curve.csv`."""
+    """Content of `result.json`; rates are null where nothing was evaluated. `curve` has the rows of `curve.csv`,
+    `nonfinite` is the number of training episodes whose simulation was not finite."""
     rate = env_steps / wall_seconds if wall_seconds > 0 else 0.0
     some = evaluation
     return {
@@ -184,7 +237,7 @@ def make_result(
         "success_interval": list(some.success_interval) if some else None,
         "raw_success_rate": some.raw_success_rate if some else None,
         "success_at_end_rate": some.success_at_end_rate if some else None,
-        "nonfinite_episodes": some.nonfinite_episodes if some else None,
+        "nonfinite_episodes": nonfinite + (some.nonfinite_episodes if some else 0),
         "ranking_steps": some.ranking_steps if some else None,
         "steps_to_50": steps_to(0.5, curve),
         "steps_to_80": steps_to(0.8, curve),

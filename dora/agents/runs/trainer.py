@@ -1,6 +1,8 @@
 """The training loop that PPO and SAC share."""
 
 import functools
+import os
+import signal
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from dora.agents.checkpoint import (
@@ -23,16 +26,18 @@ from dora.agents.checkpoint import (
     whole,
 )
 from dora.agents.collecting.rollouts import Rollouts
-from dora.agents.collecting.task_env import EpisodeColumns, MakeTask, ended_episodes
+from dora.agents.collecting.task_env import NONFINITE, EpisodeColumns, MakeTask, ended_episodes
 from dora.agents.config import RunConfig
 from dora.agents.evaluation.evaluate import PERIODIC_SEED, Evaluation, outcome
 from dora.agents.evaluation.evaluators import Evaluators
+from dora.agents.learners.finite import check_modules, check_tensors
 from dora.agents.learners.learner import Learner, make_learner
 from dora.agents.runs.interrupt import Interrupt
 from dora.agents.runs.logging import RunLog
 from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.configs import built
+from dora.errors import RECORDS, WorkerFailure
 from dora.progress import ProgressDisplay
 
 TRAINING_SEEDS = 1_000_000_000
@@ -67,6 +72,8 @@ class Counters:
     """Success rate and return of the best evaluation."""
     reached: int = 0
     """Successive evaluations that reached `stop_success`."""
+    nonfinite: int = 0
+    """Episodes that ended because their simulation was not finite."""
     curve: list[list[Any]] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=lambda: {"collect": 0.0, "learn": 0.0, "evaluate": 0.0})
 
@@ -78,7 +85,7 @@ class Trainer:
         config: settings.
         make_task: makes tasks for workers and for evaluation.
         folder: an existing run folder.
-        resume: go on from the folder's latest checkpoint.
+        resume: go on from the folder's latest checkpoint, or begin if there is none yet.
         zero: evaluate zero correction at the end, too, if there is a prior.
 
     Raises:
@@ -90,6 +97,8 @@ class Trainer:
     ):
         self.config, self.make_task, self.folder, self._zero = config, make_task, folder, zero
         torch.set_num_threads(config.learner_threads)
+        os.environ[RECORDS] = str(folder.nonfinite.absolute())  # processes that are started later see it, too
+        self.interrupted: int | None = None
         self.counters = Counters(next_evaluation=config.eval_every)
         self._evaluators = Evaluators(make_task, config)
         self.columns: EpisodeColumns = self._evaluators.env.columns
@@ -101,49 +110,72 @@ class Trainer:
         self._recent = torch.zeros(0, len(self.columns.names))
         self._resumed: dict[str, Tensor] | None = None
         self._last_evaluation: Evaluation | None = None
-        if resume:
+        if resume and folder.latest.exists():
             self._load()
 
     def run(self) -> dict[str, Any]:
         """Train until the budget is spent or `stop_success` is reached; returns what `result.json` got.
 
-        After Ctrl-C the state is saved and the result has `finished` false.
+        After Ctrl-C or SIGTERM the state is saved, the result has `finished` false, and `interrupted` is the signal.
+
+        Raises:
+            RunFailure: if training diverged, in which case the last checkpoint stays, or a worker failed, in which
+                case the state is saved; `result.json` has `finished` false.
         """
-        first_step = self.counters.env_steps
+        evaluation, zero, finished = None, None, False
         with Interrupt() as interrupt:
-            log = RunLog(self.folder.path, first_step)
-            self._table = ProgressTable(self.folder.progress, self._evaluators.env.task.stage_names, first_step)
-            finished = False
+            self.folder.mark_unfinished()
+            log = RunLog(self.folder.path, self.counters.env_steps)
             try:
-                with self._rollouts() as rollouts, ProgressDisplay() as progress:
-                    self._train(rollouts, log, progress, interrupt)
-                self.save()
-                progress.say(f"last evaluation of the best policy, on {self.config.final_episodes} episodes ...")
-                evaluation, zero = self._final_evaluation(interrupt)
-                progress.say(outcome(evaluation, zero))
+                evaluation, zero = self._train_and_evaluate(log, interrupt)
                 finished = True
             except KeyboardInterrupt:
-                self.save()
-                evaluation, zero = self._last_evaluation, None
+                self.interrupted = interrupt.number or signal.SIGINT
             finally:
                 log.close()
                 self._evaluators.close()
+                evaluation = evaluation or self._last_evaluation
+                result = self._write_result(evaluation, zero, finished)
+        return result
+
+    def _train_and_evaluate(self, log: RunLog, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
+        """Everything between the beginning and the end of a run; whatever ends it early, the state is on disk."""
+        stages, first_step = self._evaluators.env.task.stage_names, self.counters.env_steps
+        self._table = ProgressTable(self.folder.progress, stages, first_step)
+        with self._rollouts(interrupt) as rollouts, ProgressDisplay() as progress:
+            try:
+                self._train(rollouts, log, progress, interrupt)
+            except (KeyboardInterrupt, WorkerFailure) as error:
+                if not interrupt.at_once:  # else perhaps in the middle of learning
+                    self.save()
+                if interrupt.requested and isinstance(error, WorkerFailure):
+                    raise KeyboardInterrupt from None  # the same signal ended the worker
+                raise
+        self.save()
+        progress.say(f"last evaluation of the best policy, on {self.config.final_episodes} episodes ...")
+        evaluation, zero = self._final_evaluation(interrupt)
+        progress.say(outcome(evaluation, zero))
+        return evaluation, zero
+
+    def _write_result(self, evaluation: Evaluation | None, zero: Evaluation | None, finished: bool) -> dict[str, Any]:
+        counters = self.counters
         result = make_result(
             self.config,
-            env_steps=self.counters.env_steps,
-            wall_seconds=self.counters.wall_seconds,
-            episodes=self.counters.episodes,
+            env_steps=counters.env_steps,
+            wall_seconds=counters.wall_seconds,
+            episodes=counters.episodes,
             evaluation=evaluation,
             zero=zero,
-            curve=self.counters.curve,
+            curve=counters.curve,
             finished=finished,
+            nonfinite=counters.nonfinite,
         )
         if evaluation is not None:
             self.folder.write_evaluation(evaluation)
         self.folder.write_result(result)
         return result
 
-    def _rollouts(self) -> Rollouts:
+    def _rollouts(self, interrupt: Interrupt) -> Rollouts:
         config = self.config
         rollouts = Rollouts(
             functools.partial(self.make_task, config.num_envs),
@@ -154,6 +186,7 @@ class Trainer:
             seeds=seeds_for(config.seed, self.counters.env_steps + 1, max(config.workers, 1)),
             stagger=config.stagger,
             ahead=self.learner.replay is not None,
+            check=interrupt.check,
         )
         if self._resumed is not None:
             with whole(self.folder.latest):
@@ -168,10 +201,12 @@ class Trainer:
         while counters.env_steps < config.total_steps:
             interrupt.check()
             start = time.perf_counter()
-            batch = rollouts.collect()
+            batch = rollouts.collect(interrupt.check)
             collected = time.perf_counter()
             values = self.learner.update(batch)
+            check_modules(self.learner.modules)
             counters.env_steps += batch.numel()
+            self._count_nonfinite(batch, progress)
             ended = ended_episodes(batch["next", "done"], batch["next", "statistics"], self.columns)
             counters.episodes += len(ended)
             learned = time.perf_counter()
@@ -186,6 +221,18 @@ class Trainer:
                 saved = time.monotonic()
             mean_rate = counters.env_steps / max(counters.wall_seconds, 1e-9)
             show(counters.env_steps, config.total_steps, mean_rate, self._status(mean_rate))
+
+    def _count_nonfinite(self, batch: TensorDictBase, progress: ProgressDisplay) -> None:
+        """Count the episodes that were not finite, cut short or not, and tell of the first."""
+        ended = batch["next", "statistics"][batch["next", "done"][..., 0]]
+        count = int(self.columns.column(ended, NONFINITE).sum())
+        if count and not self.counters.nonfinite:
+            where = self.folder.nonfinite
+            progress.say(
+                f"The simulation of {count} episodes was not finite: they were ended, and further ones are counted"
+                + (f"; last states are in {where}." if where.exists() else ".")
+            )
+        self.counters.nonfinite += count
 
     def _status(self, rate: float) -> str:
         """Environment steps per second and the success rates in training and in the last evaluation."""
@@ -254,12 +301,13 @@ class Trainer:
     def _final_evaluation(self, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
         """Evaluate the best policy, and zero correction, on seeds that did not select it."""
         start = time.perf_counter()
-        if self.folder.best.exists():
-            best = read_checkpoint(self.folder.best)
-            unpack_modules(self.learner.policy.modules_by_name, best.tensors, self.folder.best)
-        else:
+        if not self.folder.best.exists():
             self._keep_as_best()
-        evaluation, zero = self._evaluators.final(self.learner.policy, interrupt.check, zero=self._zero)
+        with torch.random.fork_rng(devices=[]):  # networks of its own: those that learn stay as they are
+            policy = make_learner(self.config, *self.sizes).policy
+        best = read_checkpoint(self.folder.best)
+        unpack_modules(policy.modules_by_name, best.tensors, self.folder.best)
+        evaluation, zero = self._evaluators.final(policy, interrupt.check, zero=self._zero)
         self._spend("evaluate", time.perf_counter() - start)
         return evaluation, zero
 
@@ -268,11 +316,13 @@ class Trainer:
 
         Raises:
             InputError: if the disk is full; the previous checkpoint survives.
+            RunFailure: if something in it is not finite; the previous checkpoint survives.
         """
         replay = self.learner.replay
+        tensors = pack_modules(self.learner.modules) | pack_optimisers(self.learner.optimisers) | pack_rng()
+        check_tensors(tensors)
         if replay is not None:
             replay.save(self.folder.replay, self.config.digest())
-        tensors = pack_modules(self.learner.modules) | pack_optimisers(self.learner.optimisers) | pack_rng()
         self._checkpoint(tensors).write(self.folder.latest)
         if replay is not None:
             replay.forget_old_files(self.folder.replay)

@@ -6,10 +6,13 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from dora.arguments import as_tensor, suggestion
 from dora.errors import InputError
+
+MOST_LISTED = 8
+"""Environments that a message names at most [1]."""
 
 
 def plain_action(action: Any, device: torch.device | str) -> Any:
@@ -51,7 +54,7 @@ def check_action(env: Any, action: Any) -> None:
         if action["control_mode"] == env.agent.control_mode:
             check_array(action.get("action"), env._orig_single_action_space, env.num_envs, "")
         else:
-            _check_finite(action.get("action"), "")
+            _check_finite(action.get("action"), "", env.num_envs)
     elif isinstance(action, Mapping):
         _check_robots(env, action)
     elif isinstance(action, np.ndarray | torch.Tensor):
@@ -78,17 +81,43 @@ def check_array(action: Any, space: Any, environments: int, whose: str = "") -> 
     shape, single = tuple(np.shape(action)), tuple(space.shape)
     if shape != (environments, *single) and not (environments == 1 and shape == single):
         raise InputError(f"The action{whose} has shape {shape} but {(environments, *single)} is needed.")
-    _check_finite(action, whose)
+    _check_finite(action, whose, environments)
 
 
-def _check_finite(action: Any, whose: str) -> None:
-    finite = action.isfinite() if isinstance(action, torch.Tensor) else np.isfinite(action)
+def _check_finite(action: Any, whose: str, environments: int) -> None:
+    finite = action.isfinite() if isinstance(action, torch.Tensor) else torch.as_tensor(np.isfinite(action))
     if not finite.all():
+        rows = (~finite.reshape(environments, -1).all(1)).nonzero()[:, 0].tolist()
+        whose += f" of environment{'s' if len(rows) > 1 else ''} {_listed(rows)}"
         raise InputError(f"The action{whose} contains NaN or infinity: all its numbers must be finite.")
+
+
+def _listed(rows: list[int]) -> str:
+    """Indices with commas, the first few if there are many."""
+    text = ", ".join(map(str, rows[:MOST_LISTED]))
+    return text + (f" and {len(rows) - MOST_LISTED} more" if len(rows) > MOST_LISTED else "")
+
+
+def finite_rows(action: Any, bad: Bool[np.ndarray, " n"]) -> Any:
+    """What an environment computed as its robots' action, with 0 in the rows that are not finite.
+
+    Args:
+        action: a tensor (n, a), a dictionary of those, or anything else, which stays as it is.
+        bad: is set where a row is not finite.
+    """
+    if isinstance(action, Mapping):
+        return {name: finite_rows(part, bad) for name, part in action.items()}
+    if not isinstance(action, torch.Tensor) or action.shape[:1] != bad.shape or action.isfinite().all():
+        return action
+    rows = ~action.reshape(len(bad), -1).isfinite().all(1)
+    bad |= rows.numpy(force=True)
+    return torch.where(rows.reshape(-1, *[1] * (action.ndim - 1)), torch.zeros_like(action), action)
 
 
 def checked_action(action: Any, space: Any, num_envs: int, device: torch.device) -> Float[torch.Tensor, "n a"] | None:
     """An action, anything a tensor can be made of, as an (n, a) tensor without gradient; None stays None.
+
+    Numbers beyond the bounds of the space are clipped to them.
 
     Raises:
         InputError: as `check_array`.
@@ -97,4 +126,6 @@ def checked_action(action: Any, space: Any, num_envs: int, device: torch.device)
         return None
     out = plain_action(action, device)
     check_array(out, space, num_envs)
-    return out.reshape(num_envs, -1)
+    low, high = (torch.as_tensor(bound, device=device) for bound in (space.low, space.high))
+    wide = out if out.is_floating_point() else out.double()
+    return wide.clamp(low.to(wide.dtype), high.to(wide.dtype)).to(torch.float32).reshape(num_envs, -1)

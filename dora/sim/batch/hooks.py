@@ -23,7 +23,8 @@ from sapien import physx
 
 from dora.errors import InputError
 from dora.sim.batch import resets
-from dora.sim.batch.actions import check_action, plain_action
+from dora.sim.batch.actions import check_action, finite_rows, plain_action
+from dora.sim.batch.guard import StateGuard, marked
 from dora.sim.batch.rendering import can_render, replace_materials
 from dora.sim.batch.scene import BatchScene
 
@@ -55,6 +56,8 @@ def install() -> None:
         (sapien_env, "parse_sim_and_render_backend", _parse_backends),
         (BaseEnv, "__init__", _init),
         (BaseEnv, "_setup_scene", _setup_scene),
+        (BaseEnv, "reset", _reset),
+        (BaseEnv, "step", _step),
         (BaseEnv, "_step_action", _step_action),
         (BaseEnv, "reset", partial(_where_batched, resets.reset)),
         (BaseEnv, "set_state", partial(_where_batched, resets.set_state)),
@@ -157,21 +160,68 @@ def _setup_scene(original: Callable) -> Callable:
     return setup_scene
 
 
-def _step_action(original: Callable) -> Callable:
-    def step_action(self: BaseEnv, action: Any) -> Any:
-        """Checks the action, then defers the physics steps of the control step to one pass per environment."""
+def _reset(original: Callable) -> Callable:
+    def reset(self: BaseEnv, *args: Any, **kwargs: Any) -> Any:
+        """Puts bad environments back, so that those which are not reset return finite numbers, too."""
+        if not runs_batched(self) or not isinstance(self.scene, BatchScene):
+            return original(self, *args, **kwargs)
+        mend(self)
+        result = original(self, *args, **kwargs)
+        options = kwargs.get("options") or (args[1] if len(args) > 1 else None) or {}
+        rows = options.get("env_idx", slice(None))
+        self.scene.px.guard.clear(rows.cpu().numpy() if isinstance(rows, torch.Tensor) else rows)
+        return result
+
+    return reset
+
+
+def mend(env: Any) -> bool:
+    """Put the environments of a batch back whose state is bad now; returns whether there are any.
+
+    They count as bad in the next step. `env` is an unwrapped environment, on whatever back end.
+    """
+    return runs_batched(env) and bool(env.scene.px.guard.check().any())
+
+
+def _step(original: Callable) -> Callable:
+    def step(self: BaseEnv, action: Any) -> Any:
+        """ManiSkill's step, in which environments whose state becomes bad are put back and terminated."""
         if not runs_batched(self):
             return original(self, action)
+        guard: StateGuard = self.scene.px.guard  # pyright: ignore[reportAttributeAccessIssue]
+        guard.begin(action)
+        result, rows = marked(original(self, action), torch.from_numpy(guard.found))
+        guard.clear()
+        if rows.any():
+            self._last_obs = result[0]
+        return result
+
+    return step
+
+
+def _step_action(original: Callable) -> Callable:
+    def step_action(self: BaseEnv, action: Any) -> Any:
+        """Checks the action, then defers the physics steps of the control step to one pass per environment.
+
+        An environment with a `_step_action` of its own checks what the user gave. If what it makes of that is not
+        finite, the state is to blame and not the user.
+        """
+        if not runs_batched(self):
+            return original(self, action)
+        system: Any = self.scene.px
+        if type(self)._step_action is not BaseEnv._step_action:
+            action = finite_rows(action, system.guard.found)
         action = plain_action(action, self.device)
         check_action(self, action)
         hooks = ("_before_simulation_step", "_after_simulation_step")
         watched = any(_is_overridden(self, hook) for hook in hooks)
-        system: Any = self.scene.px
         system.defer(0 if watched else self._sim_steps_per_control)
         try:
-            return original(self, action)
+            result = original(self, action)
         finally:
             system.defer(0)
+        system.guard.check()
+        return result
 
     return step_action
 

@@ -71,6 +71,10 @@ class PackedSource:
         """Values of all environments as of the last `refresh`, float32, read-only; the last element is 0."""
         return self._flat
 
+    def chunks(self) -> list[bytes]:
+        """The packed values of each environment as of the last `refresh`."""
+        return list(self._chunks)
+
     def starts(self) -> np.ndarray:
         """(environments,) index of the first float of each environment in `flat`."""
         sizes = [len(chunk) // _FLOAT_BYTES for chunk in self._chunks]

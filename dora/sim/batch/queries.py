@@ -1,6 +1,6 @@
 """Contact impulse queries with the interface of SAPIEN's GPU queries, evaluated on CPU contact lists."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,11 +45,12 @@ class ContactScanner:
     """Scans the contacts of every environment at most once per physics step, and only on demand.
 
     If the contacts of the last step were asked for, those of the next step are scanned right after it,
-    environment by environment. Contact objects are not kept, because SAPIEN frees them in the next step. Subclasses
-    implement `clear` and `take`.
+    environment by environment. Contact objects are not kept, because SAPIEN frees them in the next step. Environments
+    in `muted` have none. Subclasses implement `clear` and `take`.
     """
 
     def __init__(self, readers: Sequence[Callable[[], list]]):
+        self.muted: Collection[int] = ()
         self._readers = list(readers)
         self._scanned = False
         self._asked = False
@@ -70,7 +71,12 @@ class ContactScanner:
 
     def scan(self, environment: int) -> None:
         """Scan the contacts of one environment."""
-        self.take(environment, self._readers[environment]())
+        if environment not in self.muted:
+            self.take(environment, self._readers[environment]())
+
+    def forget(self) -> None:
+        """Scan all environments again when the contacts are next asked for."""
+        self._scanned = False
 
     def scan_missing(self) -> None:
         """Scan all environments unless they were scanned since the last step."""

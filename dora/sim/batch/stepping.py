@@ -11,6 +11,8 @@ from dora.sim.batch.packed import PackedSource
 from dora.sim.batch.profile import StepProfile
 from dora.sim.batch.queries import ContactImpulses, ContactScanner
 
+SAFE = 1e14
+"""Sum of squares of poses in an environment that PhysX still steps [m^2]; false for NaN and infinity."""
 Setters = Sequence[Callable[[float], None]]
 """Functions that set one value each."""
 
@@ -52,7 +54,8 @@ class Stepper:
     interact, so results do not depend on this order.
 
     Each of `watchers` is called with the index of an environment after each of its physics steps, and each of
-    `contact_watchers` with the contacts of that step as well.
+    `contact_watchers` with the contacts of that step as well. Each of `droppers` is called with the index of an
+    environment whose contacts since the last control step do not count.
     """
 
     def __init__(self, scenes: Sequence[sapien.Scene]):
@@ -61,18 +64,27 @@ class Stepper:
         self.state = PackedSource([system.pack for system in systems])
         self._read_contacts = [system.get_contacts for system in systems]
         self.contacts = ContactImpulses(self._read_contacts)
-        self.scanners: list[ContactScanner] = [self.contacts]
+        self.scanners: list[ContactScanner] = []
+        self.droppers: list[Callable[[int], None]] = []
         self.watchers: list[Callable[[int], None]] = []
         self.contact_watchers: list[Callable[[int, list], None]] = []
         self.profile: StepProfile | None = None
         self.resized: Callable[[], None] = lambda: None
         self._steps = [system.step for system in systems]
+        self._read_poses = [scene.pack_poses for scene in scenes]
         self._targets = TargetQueue(len(systems))
         self._epoch = 0
         self._stale = True
         self._targets_stale = False
         self._waiting = 0
         self._limit = 0
+        self._muted: set[int] = set()
+        self.add_scanner(self.contacts)
+
+    def add_scanner(self, scanner: ContactScanner) -> None:
+        """Scan contacts also with this scanner, environment by environment."""
+        scanner.muted = self._muted
+        self.scanners.append(scanner)
 
     def epoch(self) -> int:
         """A counter that changes whenever the state of a simulator may have changed."""
@@ -113,6 +125,7 @@ class Stepper:
     def _advance(self, steps: range, sources: Sequence[PackedSource]) -> None:
         """Set targets, make steps and read ``sources``, one environment after the other."""
         profile, targets = self.profile, self._targets
+        self._muted.clear()
         scanners = [scanner for scanner in self.scanners if scanner.begin_step()]
         if profile:
             profile.mark()
@@ -120,7 +133,9 @@ class Stepper:
             targets.write(environment)
             if profile:
                 profile.add("write")
-            for _ in steps:
+            for number in steps:
+                if not (number == 0 and self._limit) and not self._is_safe(environment):
+                    break
                 step()
                 for watch in self.watchers:
                     watch(environment)
@@ -142,6 +157,12 @@ class Stepper:
                 scanner.scan(environment)
             if profile:
                 profile.add("contacts")
+
+    def _is_safe(self, environment: int) -> bool:
+        """Whether all poses are finite and near: PhysX may crash on others. At the beginning of a control step whose
+        steps are deferred they are known to be, because `StateGuard` has looked at them."""
+        poses = np.frombuffer(self._read_poses[environment](), np.float32)
+        return bool(poses.dot(poses) < SAFE)
 
     def refresh(self) -> None:
         """Execute all pending writes and steps, and read what is out of date."""
@@ -180,6 +201,15 @@ class Stepper:
         self._stale = True
         self.poses.invalidate(environments)
         self.state.invalidate(environments)
+
+    def discard(self, environment: int) -> None:
+        """Declare the values of an environment out of date, and drop its contacts until its next physics step."""
+        self._muted.add(environment)
+        for scanner in self.scanners:
+            scanner.forget()
+        for drop in self.droppers:
+            drop(environment)
+        self.changed([environment])
 
     def set_targets(self, setters: Setters, numbers: np.ndarray, values: np.ndarray, environments: np.ndarray) -> None:
         """Call ``setters[numbers[k]](values[k])`` for environment ``environments[k]``, now or before its next step."""

@@ -9,6 +9,7 @@ import sapien
 from sapien import physx
 
 from dora.sim.batch.bindings import make_tables
+from dora.sim.batch.guard import StateGuard
 from dora.sim.batch.layout import Layout, check_packing, pose_index, state_index
 from dora.sim.batch.profile import StepProfile
 from dora.sim.batch.queries import BodyImpulses, BodyPair, PairImpulses
@@ -43,6 +44,7 @@ class BatchSystem:
         self._systems: list[Any] = [scene.physx_system for scene in scenes]
         self.stepper = Stepper(scenes)
         self.stepper.resized = self._find_values
+        self.guard = StateGuard(scenes, self.stepper)
         self.layout = Layout({}, {})
         self._tables: dict[str, Table] = {}
 
@@ -120,6 +122,7 @@ class BatchSystem:
         """Computes the indices of all values again, after the length of the packed state changed."""
         self.pose_index = pose_index(self.layout, self._scenes, self.stepper.poses)
         self.state_index = state_index(self.layout, self._systems, self.stepper.state)
+        self.guard.locate(self.layout, self.pose_index, self.state_index)
         for table in self._tables.values():
             table.forget_plans()
 

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from dora.affordance.reach.feasibility_table import ReachTable
 from dora.sim.batch.actions import checked_action
+from dora.sim.batch.hooks import mend, runs_batched
 from dora.sim.batch.resets import nothing_reset
 from dora.tasks.env.arm import Arm
 from dora.tasks.env.arm_group import ArmGroup
@@ -256,7 +257,7 @@ class DoraEnv(BaseEnv):
     # -------------------------------------------------------------------- step
 
     def step(self, action: Any) -> tuple[Any, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """One control step with the action (n, a), or (a,) for one environment; None moves no command.
+        """One control step with the action (n, a), or (a,) for one environment, clipped to [-1, 1]; None moves none.
 
         Returns:
             Observation ((n, o) with `obs_mode="state"`), reward (n,), terminated (n,), truncated (n,) and info.
@@ -264,6 +265,8 @@ class DoraEnv(BaseEnv):
         Raises:
             InputError: if the action has another shape, or holds NaN or infinity; nothing is moved then.
         """
+        if mend(self):
+            self._snapshot = None
         return super().step(action)
 
     def _step_action(self, action: Any) -> Any:
@@ -372,7 +375,7 @@ class DoraEnv(BaseEnv):
         stages = [f"stage/{name}" for name in self.stage_names]
         verdicts = ("raw_success", "success_at_end", "finished")
         names = (*(f"reward/{name}" for name in self.terms.terms), *stages, "penetration_mm", *verdicts)
-        return (*names, "unreachable") if FILTER in self.parts else names
+        return (*names, *("nonfinite",) * runs_batched(self), *("unreachable",) * (FILTER in self.parts))
 
     # ------------------------------------------------------------------- state
 
