@@ -11,6 +11,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from dora.affordance.objects import importing
 from dora.affordance.objects.folder_reading import read_object_folder
@@ -271,7 +273,7 @@ def test_copies_of_a_material_are_one_region(tmp_path: Path):
     scene = trimesh.Scene()
     for i, name in enumerate(("clay", "steel", "steel.001")):
         part = cube(i * 0.04)
-        part.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(name=name))
+        part.visual = TextureVisuals(material=PBRMaterial(name=name))
         scene.add_geometry(part, node_name=f"part.{i:03}", geom_name=f"part.{i:03}")
     scene.export(tmp_path / "mug.glb")
     _, names = read_mesh(tmp_path / "mug.glb")
