@@ -5,9 +5,11 @@ What does the work is imported only when it is needed, so that help and version 
 
 import difflib
 import importlib
+import operator
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+from dora import quiet_start
 from dora.version import version_line
 
 COMMANDS = {
@@ -42,11 +44,18 @@ Example: dora run --env DoraHammer-v1
 """
 
 
-def main(words: Sequence[str] | None = None) -> int:
+def start(words: Sequence[str] | None = None) -> int:
+    """As `main` in a process of its own, which Ctrl-C and SIGTERM end with a line, also while it imports."""
+    quiet_start.begin()
+    return main(words, quiet_start.call)
+
+
+def main(words: Sequence[str] | None = None, around: Callable[[Callable[[], int]], int] = operator.call) -> int:
     """Run the command; returns the exit status.
 
     Args:
         words: of the command line, without the name of the program; those of the process by default.
+        around: calls what does the work of the command.
     """
     first, *rest = list(sys.argv[1:] if words is None else words) or [""]
     if first in ("", "-h", "--help"):
@@ -63,8 +72,13 @@ def main(words: Sequence[str] | None = None) -> int:
         print(f"dora has no command {first!r}.{hint} The commands are: {', '.join(COMMANDS)}.", file=sys.stderr)
         return BAD_INPUT
     sys.argv = [f"dora {first}", *rest]
+    return around(_body(first))
+
+
+def _body(name: str) -> Callable[[], int]:
+    """What does the work of a command; importing it takes seconds."""
     importlib.import_module("dora.registration")
-    return importlib.import_module(f"dora.commands.{first}").main()
+    return importlib.import_module(f"dora.commands.{name}").main
 
 
 def _complete(rest: Sequence[str]) -> int:
@@ -77,4 +91,4 @@ def _complete(rest: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(start())

@@ -3,8 +3,7 @@
 import sys
 
 if __name__ == "__main__":
-    from quiet_start import call  # before what takes seconds to import
+    sys.argv[0] = "dora"  # nothing is registered before it is known what to do
+    from dora.__main__ import start
 
-    from dora.commands.bench import main
-
-    sys.exit(call(main))
+    sys.exit(start(["bench", *sys.argv[1:]]))

@@ -7,7 +7,15 @@ import torch
 from safetensors.torch import save_file
 
 from dora.errors import InputError
-from dora.files import METADATA, read_safetensors, read_tensors, write_bytes, write_csv, write_safetensors, write_tensors
+from dora.files import (
+    METADATA,
+    read_safetensors,
+    read_tensors,
+    write_bytes,
+    write_csv,
+    write_safetensors,
+    write_tensors,
+)
 
 KIND = "dora-test 1"
 TENSORS = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.tensor([True, False])}

@@ -263,7 +263,7 @@ def test_the_first_material_is_read_whatever_stands_before_it(encoding: str, tmp
     (tmp_path / "thing.obj").write_text(text)
     (tmp_path / "a.mtl").write_text("newmtl steel\nKd 1 0 0\n", encoding=encoding)
     (tmp_path / "b.mtl").write_text("newmtl steel\n", encoding=encoding)
-    resolver = importing._Files(str(tmp_path / "thing.obj"))
+    resolver = importing._Neighbours(str(tmp_path / "thing.obj"))
     assert resolver.get("b.mtl") == b"newmtl steel\n"
     _, names = read_mesh(tmp_path / "thing.obj")
     assert names.count("steel") == 4

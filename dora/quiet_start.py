@@ -1,4 +1,4 @@
-"""Importing this lets Ctrl-C and SIGTERM end a command with one line, also while all else is still being imported."""
+"""Ctrl-C and SIGTERM end a command with one line, also while what does its work is still being imported."""
 
 import os
 import signal
@@ -17,6 +17,12 @@ def _terminate(number: int, frame: object) -> None:
     raise SystemExit(128 + number)
 
 
+def begin() -> None:
+    """Lets the signals end this process at once, with a line and without a traceback, until `call`."""
+    for number in SIGNALS:
+        signal.signal(number, _end)
+
+
 def call(main: Callable[[], int]) -> int:
     """Exit status of a command: Ctrl-C raises in it as usual, SIGTERM ends it, and neither shows a traceback."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -29,7 +35,3 @@ def call(main: Callable[[], int]) -> int:
     finally:
         for number in SIGNALS:  # the command is done, the interpreter only cleans up
             signal.signal(number, signal.SIG_IGN)
-
-
-for _number in SIGNALS:
-    signal.signal(_number, _end)
