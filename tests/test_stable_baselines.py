@@ -27,7 +27,7 @@ def test_ppo_learns_on_it(env_id: str):
     sb3 = pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
     from mani_skill.vector.wrappers.sb3 import ManiSkillSB3VectorEnv
 
-    settings = {"sim_backend": dora.sim.BACKEND, "render_backend": "none", "obs_mode": "state"}
+    settings: dict[str, Any] = {"sim_backend": dora.sim.BACKEND, "render_backend": "none", "obs_mode": "state"}
     made: Any = gym.make(env_id, num_envs=COUNT, max_episode_steps=LIMIT, **settings)
     env: Any = ManiSkillSB3VectorEnv(made)
     env.seed(3)

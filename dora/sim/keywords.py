@@ -122,7 +122,7 @@ def checked_values(cls: type, kwargs: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         InputError: one sentence about the first value that is of the wrong type or out of range.
     """
-    out = {k: "none" if k == "render_backend" and v is None else v for k, v in kwargs.items()}
+    out: dict[str, Any] = {k: "none" if k == "render_backend" and v is None else v for k, v in kwargs.items()}
     parameters = _parameters(cls)
     out |= {k: _typed(k, v, parameters[k].annotation) for k, v in out.items() if k in ("num_envs", "sim_backend")}
     if out.get("num_envs", 1) < 1:
