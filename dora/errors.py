@@ -1,5 +1,4 @@
-"""The exceptions that Dora raises for what a person can correct and for runs that cannot go on, and values as messages
-show them."""
+"""The exceptions that Dora raises for what people can correct, and for runs that fail; values as messages show them."""
 
 import reprlib
 

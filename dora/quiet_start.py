@@ -5,6 +5,7 @@ import signal
 from collections.abc import Callable
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that end a command."""
 
 
 def _end(number: int, frame: object) -> None:

@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 
 LEVELS = {
-    "errors": 0, "reading": 0.4, "arguments": 0.5, "configs": 0.5, "containers": 0.5, "digests": 0.5, "files": 0.5,
-    "parallel": 0.5, "progress": 0.5, "tables": 0.5,
+    "errors": 0, "version": 0, "quiet_start": 0, "reading": 0.4, "arguments": 0.5, "configs": 0.5, "containers": 0.5,
+    "digests": 0.5, "files": 0.5, "parallel": 0.5, "progress": 0.5, "tables": 0.5,
     "geometry": 1, "robot": 2, "robot.motion": 3,
     "affordance.objects": 4, "affordance.hand": 5, "affordance.maps": 6, "affordance": 7, "affordance.search": 8,
     "affordance.reach": 8, "affordance.views": 9,
     "sim.batch": 10, "sim": 11, "sim.grasp_tests": 12,
     "tasks.mdp": 13, "tasks.guidance": 14, "tasks.env": 15, "tasks.hammer": 16, "tasks": 17,
-    "tools": 18, "commands": 19,
+    "registration": 18, "tools": 18, "commands": 19, "__main__": 20,
 }  # fmt: skip
 """A room may import itself and rooms of a lower level; a room inside one that is not listed belongs to it."""
 LEARNERS = {

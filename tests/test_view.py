@@ -88,8 +88,9 @@ def test_description(candidates: GraspCandidates):
     assert "not valid" in text
     assert "succeeded in 82 %" in text
     assert "closure: 2" in text
-    points = torch.bincount(candidates.contact_map[2].long())
-    assert f"contact map: palm {points[1]}, " in text
+    points = torch.bincount(candidates.contact_map[2].long(), minlength=len(PARTS))[1:].tolist()
+    shown = ", ".join(f"{part} {count}" for part, count in zip(list(PARTS)[1:], points, strict=True) if count)
+    assert f"contact map: {shown}" in text
     none = replace(candidates, contact_map=torch.zeros(COUNT, 0, dtype=torch.uint8))
     assert "contact map: none" in describe(none, 2)
 

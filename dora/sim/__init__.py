@@ -7,8 +7,8 @@ Importing this package makes ``sim_backend="physx_cpu_batch"`` known to ManiSkil
 """
 
 from dora.sim.batch.hooks import BACKEND, install, runs_batched
-from dora.sim.batch.profile import StepProfile
 from dora.sim.batch.rendering import can_render
+from dora.sim.batch.stepping import StepProfile
 from dora.sim.keywords import install_keywords
 from dora.sim.wrappers import install_wrappers
 

@@ -11,9 +11,8 @@ from sapien import physx
 from dora.sim.batch.bindings import make_tables
 from dora.sim.batch.guard import StateGuard
 from dora.sim.batch.layout import Layout, check_packing, pose_index, state_index
-from dora.sim.batch.profile import StepProfile
 from dora.sim.batch.queries import BodyImpulses, BodyPair, PairImpulses
-from dora.sim.batch.stepping import Stepper
+from dora.sim.batch.stepping import Stepper, StepProfile
 from dora.sim.batch.table import Table
 
 
