@@ -52,6 +52,7 @@ def added(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> tuple
     return root, os.environ | {"PYTHONPATH": paths, "DORA_OBJECTS": str(root / "objects")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("toy", ["DoraBlock", "DoraPair"])
 def test_all_tests_of_tasks_pass_on_it(added: tuple[Path, dict[str, str]], project_root: Path, toy: str):
     """The second one has two arms that stand opposite each other, and two objects."""

@@ -84,6 +84,7 @@ def test_a_command_runs_in_any_folder(tmp_path: Path):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_the_import_registers_everything_elsewhere(tmp_path: Path):
     """Also in a module that is started by -m, and in a script whose name begins like the command's."""
     body = "import dora, gymnasium as gym; gym.spec('DoraCube-v1'); gym.spec('PickCube-v1'); print('found')"

@@ -250,6 +250,7 @@ def _rows(state: Any, rows: Any) -> Any:
     return {n: _rows(p, rows) for n, p in state.items()} if isinstance(state, dict) else state[rows]
 
 
+@pytest.mark.slow
 def test_states_with_objects_of_other_sizes_leave_the_random_numbers_of_the_others():
     one, two, three = (gym.make("DoraJug-v1", num_envs=3, preset="standard").unwrapped for _ in range(3))
     one.reset(seed=0)

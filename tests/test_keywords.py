@@ -121,6 +121,7 @@ assert gym.make("PickCube-v1", render_backend="none").unwrapped.backend.sim_back
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="with CUDA ManiSkill's own back end is the default")
 def test_several_environments_without_cuda_run_batched_and_it_is_said_once(project_root: Path):
     done = subprocess.run([sys.executable, "-c", DEFAULT], cwd=project_root, capture_output=True, text=True)

@@ -94,6 +94,7 @@ def played(recordings: dict[str, Path], project_root: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "way"), PLAYED)
 def test_recordings_are_played_again(recordings: dict[str, Path], played: str, name: str, way: str):
     path = recordings[name]

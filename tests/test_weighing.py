@@ -226,6 +226,7 @@ def test_a_folder_of_a_given_density(cache: Path, monkeypatch: pytest.MonkeyPatc
     assert load_object(cache / "brick").mass == pytest.approx(0.06)
 
 
+@pytest.mark.slow
 def test_more_grasps_of_a_hollow_vessel_are_valid_than_of_a_solid_one(cache: Path):
     """22 cm high: weighed as a solid few are valid, weighed as what it is about half."""
     shares = {}
