@@ -56,6 +56,30 @@ def test_seeds_of_a_group_make_one_row(tmp_path: Path):
     assert len(rows) == 5
 
 
+def test_runs_of_tasks_with_other_numbers_are_not_averaged(tmp_path: Path):
+    """Named by the switch where it tells them apart, else by all that differs."""
+    numbers = [
+        {"optimised": False, "weights": {"lift": 3.0}, "same": 1},
+        {"optimised": False, "weights": {"lift": 3.0}, "same": 1},
+        {"optimised": True, "weights": {"lift": 2.0}, "same": 1},
+    ]
+    for seed, each in enumerate(numbers):
+        write_run(tmp_path / str(seed), seed, 0.2 * seed)
+        path = tmp_path / str(seed) / "result.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"task_config": each}))
+    rows = tables(find_runs(tmp_path)).splitlines()[2:]
+    assert [row.split(" | ")[3:5] for row in rows] == [
+        ["affordance, optimised False", "2"], ["affordance, optimised True", "1"],
+    ]  # fmt: skip
+    path = tmp_path / "1" / "result.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"task_config": numbers[0] | {"weights": {"lift": 1.0}}}))
+    rows = tables(find_runs(tmp_path)).splitlines()[2:]
+    assert [row.split(" | ")[3] for row in rows] == [
+        "affordance, optimised False, weights.lift 1.0", "affordance, optimised False, weights.lift 3.0",
+        "affordance, optimised True, weights.lift 2.0",
+    ]  # fmt: skip
+
+
 def test_success_has_the_interval_of_all_episodes_and_zero_correction_that_of_each_start_once(tmp_path: Path):
     write_run(tmp_path / "a", 0, 0.9, episodes=200)
     write_run(tmp_path / "b", 1, 1.0, episodes=200)

@@ -1,7 +1,7 @@
 """Finished runs as they lie in folders, and which of them make one row of a report."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -68,11 +68,42 @@ def find_runs(root: Path) -> list[Run]:
 
 
 def grouped(runs: Sequence[Run]) -> dict[Group, list[Run]]:
-    """The runs of each row of a table, in its order."""
+    """The runs of each row of a table, in its order; runs whose tasks have other numbers are rows of their own, whose
+    guidance names the difference."""
     groups: dict[Group, list[Run]] = defaultdict(list)
     for run in runs:
         groups[run.group].append(run)
-    return dict(sorted(groups.items()))
+    rows: dict[Group, list[Run]] = {}
+    for (env, preset, agent, guidance, thousands), members in groups.items():
+        for difference, alike in _by_task(members).items():
+            rows[env, preset, agent, guidance + difference, thousands] = alike
+    return dict(sorted(rows.items()))
+
+
+def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Runs by what the numbers of their task differ in, in words: by switches alone where these tell them apart."""
+    numbers = [dict(_flat(run.result.get("task_config") or {})) for run in runs]
+    names = sorted({name for each in numbers for name in each})
+    different = [name for name in names if len({str(each.get(name)) for each in numbers}) > 1]
+    switches = [name for name in different if isinstance(numbers[0].get(name), bool | str)]
+    by_switch, by_all = (
+        [tuple(str(each.get(name)) for name in some) for each in numbers] for some in (switches, different)
+    )
+    enough = len(set(by_switch)) == len(set(by_all))
+    found: dict[str, list[Run]] = defaultdict(list)
+    for run, values in zip(runs, by_switch if enough else by_all, strict=True):
+        words = zip(switches if enough else different, values, strict=True)
+        found["".join(f", {name} {value}" for name, value in words)].append(run)
+    return found
+
+
+def _flat(numbers: dict[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Names with dots, and values, of nested numbers."""
+    for name, value in numbers.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{before}{name}.")
+        else:
+            yield before + name, value
 
 
 def success_shares(runs: Sequence[Run]) -> list[tuple[float, int]]:
