@@ -9,6 +9,13 @@ import torch
 
 torch.set_num_threads(1)
 
+LONG = ("test_tasks.py", "test_agents_train.py", "test_run_failures.py", "test_adding_a_task.py", "test_hammer.py")
+"""Modules that take longest; they come first, so that no process is left with one of them when the others are done."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]):
+    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
+
 
 @pytest.fixture(scope="session")
 def project_root(pytestconfig: pytest.Config):

@@ -258,6 +258,7 @@ FOREIGN = {
 """A laboratory beaker and a CAD part, which ManiSkill contains: options, and a region that they get here."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FOREIGN)
 def test_labelled_meshes_by_others_go_all_the_way(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str

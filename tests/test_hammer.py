@@ -358,6 +358,7 @@ def test_the_nail_never_comes_back_up_and_a_restored_one_stays_where_it_was(benc
 # ---------------------------------------------------------------------- solution
 
 
+@pytest.mark.slow
 def test_the_script_catches_strikes_and_stays_clean():
     starts = 50
     task = tasks.make_task("DoraHammer-v1", starts, preset="none")

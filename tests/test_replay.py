@@ -114,6 +114,7 @@ def _last_places(trajectory: Any) -> np.ndarray:
     return np.stack([np.array(states)[-2, :3] for states in trajectory["env_states"]["actors"].values()])
 
 
+@pytest.mark.slow
 def test_a_recording_says_how_it_is_opened(recordings: dict[str, Path]):
     for name, path in recordings.items():
         info = json.loads(path.with_suffix(".json").read_text())["env_info"]
