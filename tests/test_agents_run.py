@@ -189,7 +189,7 @@ def test_policies_of_versions_without_numbers_mean_the_numbers_of_then(path: Pat
 def test_a_bundled_policy_can_be_evaluated_alone(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    policy = next(path for path in COMMITTED if "DoraCube-v1" in path.parts)
+    policy = next(path for path in COMMITTED if path.parts[-3:-1] == ("DoraCube-v1", "ppo-affordance-s10"))
     arguments = f"--eval-only --checkpoint {policy} --episodes 4 --workers 1 --preset none --out {tmp_path / 'eval'}"
     assert call(script, monkeypatch, *arguments.split()) == 0
     captured = capsys.readouterr()
