@@ -58,6 +58,7 @@ def _init(original: Callable) -> Callable:
     names = list(inspect.signature(original).parameters)[1:]
 
     def init(self: BaseEnv, *args: Any, **kwargs: Any) -> None:
+        """ManiSkill's, after a check of every keyword; InputError about the first that is wrong."""
         kwargs = {**dict(zip(names, args, strict=False)), **kwargs}
         check_names(type(self), kwargs, names)
         if _is_checked(type(self), kwargs):

@@ -152,6 +152,7 @@ class ReachTable:
             return table
 
         def make() -> ReachTable:
+            """The table of all nodes of the grid, computed now."""
             nodes, count, found = grid.nodes(), max(1, CHUNK // len(candidates)), []
             for part in nodes.split(count):
                 position, quaternion = poses(part, height, rest)

@@ -122,6 +122,7 @@ def _say_default() -> None:
 
 def _init(original: Callable) -> Callable:
     def init(self: BaseEnv, num_envs: Any = 1, *args: Any, **kwargs: Any) -> None:
+        """ManiSkill's, with this back end as the default where it is; InputError for what the back end cannot do."""
         whole = isinstance(num_envs, int | np.integer)
         if whole and batched_by_default(kwargs.get("sim_backend", "auto"), int(num_envs)):
             kwargs["sim_backend"] = BACKEND
