@@ -2,30 +2,25 @@
 
 import json
 import os
-import resource
 import struct
-import time
-import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-import trimesh
 from boxes import two_regions
 from probes import load_results, write_result
+from refusals import ENTITIES, refused, written
 
 from dora.affordance.maps.packed_maps import COUNT, PART, POINT, unpack
 from dora.affordance.objects.folder_reading import read_object_folder
-from dora.affordance.objects.importing import import_object, read_mesh
+from dora.affordance.objects.importing import read_mesh
 from dora.affordance.objects.labels import read_labels
 from dora.affordance.views.page import describe, start_server
 from dora.agents.runs.report import write_report
 from dora.agents.runs.run_folder import RunFolder
-from dora.errors import InputError
 from dora.files import read_tensors
 from dora.reading import read_array, read_toml, read_xml, read_yaml
 from dora.robot.urdf import read_urdf
@@ -37,40 +32,8 @@ LAUGHS = "regions: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
 )
 CURVE = "env_steps,wall_seconds,success_rate,return_mean,penetration_p95_mm"
 """First line of a curve.csv."""
-ENTITIES = '<!DOCTYPE l [<!ENTITY a "aaaaaaaaaa">]>'
 LOOP = '<robot><link name="a"/><joint name="j" type="fixed"><parent link="a"/><child link="a"/></joint></robot>'
 """A URDF of a link that is its own child."""
-MESH: dict[str, Any] = {
-    "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "bufferViews": [],
-    "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-    "accessors": [{"count": 300, "componentType": 5126, "type": "VEC3"},
-                  {"count": 300_000, "componentType": 5125, "type": "SCALAR"}],
-}  # fmt: skip
-"""A glTF file of 100,000 triangles without any data."""
-
-
-@contextmanager
-def refused(words: str, seconds: float = 3.0) -> Iterator[None]:
-    """Expects one sentence with these words, soon, and no growth of the memory above 300 MB."""
-    start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(InputError, match=words) as caught:
-        yield
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 1300
-    assert time.perf_counter() - start < seconds
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000
-
-
-def written(path: Path, content: str | bytes) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
-
-
-def glb(header: dict[str, Any] | bytes) -> bytes:
-    text = header if isinstance(header, bytes) else json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    return b"glTF" + struct.pack("<II", 2, 20 + len(text)) + struct.pack("<II", len(text), 0x4E4F534A) + text
 
 
 def npy(kind: str, shape: str, data: bytes = b"") -> bytes:
@@ -165,14 +128,6 @@ def test_an_array_is_read_in_its_order(tmp_path: Path):
         assert read_array(tmp_path / "a.npy", "file", 1000).tolist() == array.tolist()
 
 
-@pytest.mark.parametrize("name", ["a.stl", "a.obj", "a.ply", "a.glb", "a.gltf", "a.off", "a.3mf"])
-def test_huge_meshes_are_refused_by_their_size(tmp_path: Path, name: str):
-    with (tmp_path / name).open("wb") as stream:
-        stream.truncate(10**11)
-    with refused("at most 64000000", 1.0):
-        read_mesh(tmp_path / name)
-
-
 def test_other_huge_files_are_refused_by_their_size(tmp_path: Path):
     readers: dict[str, Callable[[Path], object]] = {
         "labels.npy": lambda path: read_labels(path, CENTRES),
@@ -198,90 +153,6 @@ def test_what_is_no_file_is_refused(tmp_path: Path):
         read_mesh(written(tmp_path / "x.stl" / "y", "").parent)
     with refused("There is no"):
         read_yaml(Path("a\0b.yaml"), "file")
-
-
-@pytest.mark.parametrize(
-    ("header", "words"),
-    [
-        (MESH | {"accessors": [{"count": 10**10, "componentType": 5126, "type": "VEC3"}]}, "declares"),
-        (MESH | {"nodes": [{"children": list(range(1, 5000))}, *[{"mesh": 0}] * 5000]}, "faces; reduce it"),
-        (MESH | {"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}, "contains itself"),
-        (MESH | {"nodes": [*({"children": [i + 1, i + 1]} for i in range(30)), {"mesh": 0}]}, "repeats its parts"),
-        (MESH | {"nodes": [{"children": [1, 1]}, {"mesh": 0}]}, "several parents"),
-        (MESH | {"nodes": [{}] * 10_001}, "more than 10000 nodes"),
-        (b'{"a":' + b"[" * 100_000, "not valid JSON"),
-        ([], "no glTF header"),
-    ],
-)
-def test_gltf(tmp_path: Path, header: Any, words: str):
-    with refused(words):
-        read_mesh(written(tmp_path / "a.glb", glb(header if isinstance(header, bytes) else header or b"[]")))
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3\n" * 200_001, "200001 faces"),
-        ("a.obj", "v 0 0 0\n" * 1_500_001, "1500001 lines"),
-        ("a.off", "OFF\n3 600000 0\n" + "0 0 0\n" * 600_000, "600002 lines"),
-        ("a.ply", "ply\nformat ascii 1.0\n" + "0 0 0\n" * 600_000, "600002 lines"),
-    ],
-)
-def test_meshes_in_text_have_a_limit_of_lines(tmp_path: Path, name: str, content: str, words: str):
-    with refused(words):
-        read_mesh(written(tmp_path / name, content))
-
-
-@pytest.mark.parametrize("name", ["/dev/zero", "../../etc/passwd", "/etc/passwd"])
-def test_a_mesh_reads_no_files_elsewhere(tmp_path: Path, name: str):
-    content = MESH | {"buffers": [{"uri": name, "byteLength": 10}]}
-    with refused("does not lie beside it"):
-        read_mesh(written(tmp_path / "a.gltf", json.dumps(content)))
-    mesh = f"mtllib {name}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
-    assert len(read_mesh(written(tmp_path / "a.obj", mesh))[0].faces) == 1
-
-
-def test_archives(tmp_path: Path):
-    with zipfile.ZipFile(tmp_path / "bomb.3mf", "w", zipfile.ZIP_DEFLATED) as archive:
-        for k in range(13):
-            archive.writestr(f"3D/{k}.model", b" " * 10_000_000)
-    with refused("unpacks to more than"):
-        read_mesh(tmp_path / "bomb.3mf")
-    for name, words in (("bomb.zip", "cannot be read as a mesh"), ("bomb.stl", "zip file")):
-        with refused(words):
-            read_mesh(written(tmp_path / name, (tmp_path / "bomb.3mf").read_bytes()))
-    with refused("packed .gzip."):
-        read_mesh(written(tmp_path / "a.obj", b"\x1f\x8b\x08"))
-    parts = "".join(
-        f'<object id="{i}"><components>' + f'<component objectid="{i + 1}"/>' * 4 + "</components></object>"
-        for i in range(1, 30)
-    )
-    namespace = 'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"'
-    for model, words in ((parts, "repeats its parts"), (f"{ENTITIES}", "declares a document type|not valid XML")):
-        with zipfile.ZipFile(tmp_path / "a.3mf", "w") as archive:
-            archive.writestr("3D/3dmodel.model", f"<model {namespace}>{model}</model>")
-        with refused(words):
-            read_mesh(tmp_path / "a.3mf")
-
-
-def test_many_loose_triangles(tmp_path: Path):
-    corners = np.random.default_rng(0).random((50_000, 3, 3))
-    trimesh.Trimesh(corners.reshape(-1, 3), np.arange(150_000).reshape(-1, 3), process=False).export(tmp_path / "a.stl")
-    with refused("falls into 50000 parts", 5.0):
-        import_object(tmp_path / "a.stl", cache_dir=tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 999\n", "out of bounds|do not exist"),
-        ("v 0 0 0\nf -1 -2 -9\n", "out of bounds|do not exist"),
-        ("v 0\nv 1\nv 2\nf 1 2 3\n", "three numbers|cannot be read"),
-    ],
-)
-def test_faces_out_of_range(tmp_path: Path, content: str, words: str):
-    with refused(words):
-        read_mesh(written(tmp_path / "a.obj", content))
 
 
 @pytest.mark.parametrize(

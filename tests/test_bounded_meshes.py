@@ -1,0 +1,120 @@
+"""Meshes made to be expensive are refused in one sentence, at once and without memory."""
+
+import json
+import struct
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from refusals import ENTITIES, refused, written
+
+from dora.affordance.objects.importing import import_object, read_mesh
+
+MESH: dict[str, Any] = {
+    "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "bufferViews": [],
+    "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+    "accessors": [{"count": 300, "componentType": 5126, "type": "VEC3"},
+                  {"count": 300_000, "componentType": 5125, "type": "SCALAR"}],
+}  # fmt: skip
+"""A glTF file of 100,000 triangles without any data."""
+
+
+def glb(header: dict[str, Any] | bytes) -> bytes:
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    return b"glTF" + struct.pack("<II", 2, 20 + len(text)) + struct.pack("<II", len(text), 0x4E4F534A) + text
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.obj", "a.ply", "a.glb", "a.gltf", "a.off", "a.3mf"])
+def test_huge_meshes_are_refused_by_their_size(tmp_path: Path, name: str):
+    with (tmp_path / name).open("wb") as stream:
+        stream.truncate(10**11)
+    with refused("at most 64000000", 1.0):
+        read_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        (MESH | {"accessors": [{"count": 10**10, "componentType": 5126, "type": "VEC3"}]}, "declares"),
+        (MESH | {"nodes": [{"children": list(range(1, 5000))}, *[{"mesh": 0}] * 5000]}, "faces; reduce it"),
+        (MESH | {"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}, "contains itself"),
+        (MESH | {"nodes": [*({"children": [i + 1, i + 1]} for i in range(30)), {"mesh": 0}]}, "repeats its parts"),
+        (MESH | {"nodes": [{"children": [1, 1]}, {"mesh": 0}]}, "several parents"),
+        (MESH | {"nodes": [{}] * 10_001}, "more than 10000 nodes"),
+        (b'{"a":' + b"[" * 100_000, "not valid JSON"),
+        ([], "no glTF header"),
+    ],
+)
+def test_gltf(tmp_path: Path, header: Any, words: str):
+    with refused(words):
+        read_mesh(written(tmp_path / "a.glb", glb(header if isinstance(header, bytes) else header or b"[]")))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3\n" * 200_001, "200001 faces"),
+        ("a.obj", "v 0 0 0\n" * 1_500_001, "1500001 lines"),
+        ("a.off", "OFF\n3 600000 0\n" + "0 0 0\n" * 600_000, "600002 lines"),
+        ("a.ply", "ply\nformat ascii 1.0\n" + "0 0 0\n" * 600_000, "600002 lines"),
+    ],
+)
+def test_meshes_in_text_have_a_limit_of_lines(tmp_path: Path, name: str, content: str, words: str):
+    with refused(words):
+        read_mesh(written(tmp_path / name, content))
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "../../etc/passwd", "/etc/passwd"])
+def test_a_mesh_reads_no_files_elsewhere(tmp_path: Path, name: str):
+    content = MESH | {"buffers": [{"uri": name, "byteLength": 10}]}
+    with refused("does not lie beside it"):
+        read_mesh(written(tmp_path / "a.gltf", json.dumps(content)))
+    mesh = f"mtllib {name}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    assert len(read_mesh(written(tmp_path / "a.obj", mesh))[0].faces) == 1
+
+
+def test_archives(tmp_path: Path):
+    with zipfile.ZipFile(tmp_path / "bomb.3mf", "w", zipfile.ZIP_DEFLATED) as archive:
+        for k in range(13):
+            archive.writestr(f"3D/{k}.model", b" " * 10_000_000)
+    with refused("unpacks to more than"):
+        read_mesh(tmp_path / "bomb.3mf")
+    for name, words in (("bomb.zip", "cannot be read as a mesh"), ("bomb.stl", "zip file")):
+        with refused(words):
+            read_mesh(written(tmp_path / name, (tmp_path / "bomb.3mf").read_bytes()))
+    with refused("packed .gzip."):
+        read_mesh(written(tmp_path / "a.obj", b"\x1f\x8b\x08"))
+    parts = "".join(
+        f'<object id="{i}"><components>' + f'<component objectid="{i + 1}"/>' * 4 + "</components></object>"
+        for i in range(1, 30)
+    )
+    namespace = 'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"'
+    for model, words in ((parts, "repeats its parts"), (f"{ENTITIES}", "declares a document type|not valid XML")):
+        with zipfile.ZipFile(tmp_path / "a.3mf", "w") as archive:
+            archive.writestr("3D/3dmodel.model", f"<model {namespace}>{model}</model>")
+        with refused(words):
+            read_mesh(tmp_path / "a.3mf")
+
+
+def test_many_loose_triangles(tmp_path: Path):
+    corners = np.random.default_rng(0).random((50_000, 3, 3))
+    trimesh.Trimesh(corners.reshape(-1, 3), np.arange(150_000).reshape(-1, 3), process=False).export(tmp_path / "a.stl")
+    with refused("falls into 50000 parts", 5.0):
+        import_object(tmp_path / "a.stl", cache_dir=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 999\n", "out of bounds|do not exist"),
+        ("v 0 0 0\nf -1 -2 -9\n", "out of bounds|do not exist"),
+        ("v 0\nv 1\nv 2\nf 1 2 3\n", "three numbers|cannot be read"),
+    ],
+)
+def test_faces_out_of_range(tmp_path: Path, content: str, words: str):
+    with refused(words):
+        read_mesh(written(tmp_path / "a.obj", content))
