@@ -1,7 +1,7 @@
 """Interrupts real training runs at chosen moments, and tells how they end and whether they go on.
 
     python -m dora.commands.interruptions --moments 1 5 20 --signal TERM
-    python -m dora.commands.interruptions --moments 2 12 30 --signal KILL --group
+    python -m dora.commands.interruptions --moments 2 12 30 --signal KILL --group --training
 
 Prints one line per moment: seconds to the first line after the signal, seconds to the end, exit status, steps in the
 checkpoint, names left among shared memory and temporary files at the end and after the run was resumed, and what is
@@ -73,8 +73,23 @@ def command(*options: str) -> list[str]:
     return [sys.executable, str(Path(__file__).parents[2] / "experiments" / "run.py"), *options]
 
 
-def interrupt(words: list[str], number: int, moment: float, group: bool) -> tuple[float | None, float, int, str, int]:
+def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
+    """Wait until a file exists, or the process that writes it has ended."""
+    while not path.exists() and process.poll() is None:
+        time.sleep(0.05)
+
+
+def interrupt(
+    words: list[str], number: int, moment: float, group: bool, after: Path | None = None
+) -> tuple[float | None, float, int, str, int]:
     """Start a command, send it a signal after `moment` [s], and wait for its end.
+
+    Args:
+        words: of the command line.
+        number: of the signal.
+        moment: since the start, or since the file `after` exists [s].
+        group: send it to all processes of the command.
+        after: a file that the command writes.
 
     Returns:
         Seconds to the first line after the signal, None without one; seconds to the end; exit status; what it said;
@@ -89,9 +104,12 @@ def interrupt(words: list[str], number: int, moment: float, group: bool) -> tupl
 
     listener = threading.Thread(target=listen, daemon=True)
     listener.start()
+    if after is not None:
+        wait_for(after, process)
     time.sleep(moment)
     sent = time.monotonic()
-    (os.killpg if group else os.kill)(process.pid, number)
+    with contextlib.suppress(ProcessLookupError):  # it may have ended
+        (os.killpg if group else os.kill)(process.pid, number)
     try:
         process.wait(6 * END)
     finally:
@@ -103,9 +121,12 @@ def interrupt(words: list[str], number: int, moment: float, group: bool) -> tupl
     return first, ended, process.returncode, "".join(line for _, line in lines), process.pid
 
 
-def judged(number: int, moment: float, folder: Path, group: bool, options: tuple[str, ...] = SHORT) -> Outcome:
+def judged(
+    number: int, moment: float, folder: Path, group: bool, options: tuple[str, ...] = SHORT, training: bool = False
+) -> Outcome:
     """Interrupt a new run in `folder` and judge how it ends; a run that had finished before is judged, too."""
-    line, end, status, said, process = interrupt(command(*options, "--out", str(folder)), number, moment, group)
+    words, after = command(*options, "--out", str(folder)), RunFolder(folder).progress if training else None
+    line, end, status, said, process = interrupt(words, number, moment, group, after)
     problems, steps = [], None
     if "Traceback" in said:
         problems.append(f"traceback: {said.strip().splitlines()[-1]}")
@@ -141,7 +162,9 @@ class Args:
     """Interrupt short runs of the cube at several moments."""
 
     moments: tuple[float, ...] = (1.0, 5.0, 15.0, 30.0)
-    """Times after the start of a run [s]."""
+    """Times after the start of a run, or of its training [s]."""
+    training: bool = False
+    """Count the moments from the first iteration of training, which start-up delays by more or less."""
     signal: Literal["INT", "TERM", "KILL"] = "INT"
     """What is sent."""
     group: bool = False
@@ -156,7 +179,7 @@ def main() -> int:
     number = getattr(signal, f"SIG{args.signal}")
     for moment in args.moments:
         place = Path(tempfile.mkdtemp(prefix="interruptions-"))
-        outcome = judged(number, moment, place / "run", args.group)
+        outcome = judged(number, moment, place / "run", args.group, training=args.training)
         if args.resume:
             resumed(outcome, place / "run")
         print(outcome, flush=True)

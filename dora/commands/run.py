@@ -29,6 +29,7 @@ from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed, outcome
 from dora.agents.evaluation.play import checkpoint_path, evaluate_checkpoint, evaluate_zero, load_policy, record
 from dora.agents.limits import check
 from dora.agents.runs.interrupt import STATUS, ending_at_once
+from dora.agents.runs.logging import add_film
 from dora.agents.runs.recommended import recommended
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.agents.runs.trainer import Trainer
@@ -192,8 +193,8 @@ def train(args: Args) -> tuple[Path, int]:
         if trainer.interrupted is not None:
             print(f"Interrupted and saved. {go_on}", file=sys.stderr)
             return folder.path, STATUS + trainer.interrupted
-    if args.video:
-        film(folder.best, config, folder.video / "best.mp4")
+    if args.video and film(folder.best, config, folder.video / "best.mp4"):
+        add_film(folder.path, folder.video / "best.mp4", trainer.counters.env_steps)
     return folder.path, 0
 
 
@@ -228,8 +229,8 @@ def evaluate_only(args: Args) -> Path:
     return folder.path
 
 
-def film(checkpoint: Path | None, config: RunConfig, path: Path, seed: int = FINAL_SEED) -> None:
-    """Film the policy of a checkpoint, or zero correction without one, or say in one line why not."""
+def film(checkpoint: Path | None, config: RunConfig, path: Path, seed: int = FINAL_SEED) -> bool:
+    """Film the policy of a checkpoint, or zero correction without one, or say in one line why not; returns whether."""
     act = None if checkpoint is None else load_policy(read_checkpoint(checkpoint), checkpoint).greedy
     make_single_task = functools.partial(task_maker(config), 1, render_mode="rgb_array")
     try:
@@ -237,6 +238,8 @@ def film(checkpoint: Path | None, config: RunConfig, path: Path, seed: int = FIN
     except (RuntimeError, InputError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         print(f"No video: nothing can be rendered here ({reason}).", file=sys.stderr)
+        return False
+    return True
 
 
 def main() -> int:

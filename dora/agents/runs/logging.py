@@ -1,10 +1,18 @@
-"""TensorBoard tags, what they mean, and the writer that uses them."""
+"""What TensorBoard shows of a run: tags and what they mean, layout, hyperparameters, film, and their writer."""
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import imageio.v2 as imageio
+import numpy as np
+from tensorboard.compat.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
 
+from dora.agents.config import RunConfig
+from dora.configs import plain
 from dora.tables import markdown_table
 
 TAGS: dict[str, str] = {
@@ -12,16 +20,20 @@ TAGS: dict[str, str] = {
     "evaluation/return_mean": "mean sum of rewards of evaluation episodes",
     "evaluation/penetration_p95_mm": "95th percentile of the largest penetration of evaluation episodes [mm]",
     "evaluation/stage/<name>": "share of evaluation episodes that reached the stage",
-    "episode/success_rate": "share of this iteration's training episodes that end in success",
-    "episode/raw_success_rate": "the same, overlap not counted",
-    "episode/success_at_end_rate": "share of successes in which what was reached still holds in the last step",
-    "episode/return_mean": "mean sum of rewards of those episodes",
-    "episode/length_mean": "mean length of those episodes [control steps]",
-    "episode/reward/<term>": "mean per control step of the reward term over those episodes, weight included",
-    "episode/stage/<name>": "share of those episodes that reached the stage",
-    "episode/penetration_mm": "mean over those episodes of their largest penetration [mm]",
-    "episode/nonfinite": "share of those episodes that ended because their simulation was not finite",
-    "episode/<other>": "mean per control step of any other value that the task logs",
+    "evaluation/film": "the best policy, if a film was asked for with --video and can be rendered",
+    "final/success_rate": "share of successes in the last evaluation of the best policy, as in result.json",
+    "final/zero_success_rate": "the same without any correction",
+    "final/penetration_p95_mm": "95th percentile of the largest penetration in the last evaluation [mm]",
+    "training/success_rate": "share of this iteration's episodes that end in success",
+    "training/raw_success_rate": "the same, overlap not counted",
+    "training/success_at_end_rate": "share of successes in which what was reached still holds in the last step",
+    "training/return_mean": "mean sum of rewards of those episodes",
+    "training/length_mean": "mean length of those episodes [control steps]",
+    "training/reward/<term>": "mean per control step of the reward term over those episodes, weight included",
+    "training/stage/<name>": "share of those episodes that reached the stage",
+    "training/penetration_mm": "mean over those episodes of their largest penetration [mm]",
+    "training/nonfinite": "share of those episodes that ended because their simulation was not finite",
+    "training/<other>": "mean per control step of any other value that the task logs",
     "loss/policy": "PPO: clipped surrogate objective, negative",
     "loss/value": "PPO: squared error of the value times its weight",
     "loss/bound": "PPO: mean squared excess of mean actions over [-1, 1], without its weight",
@@ -45,6 +57,25 @@ TAGS: dict[str, str] = {
 }
 """TensorBoard tags and what they mean."""
 
+FILM = "evaluation/film"
+"""Tag of the film of the best policy."""
+FINAL = ("success_rate", "zero_success_rate", "penetration_p95_mm")
+"""Entries of `result.json` that stand beside the settings of a run."""
+LAYOUT = {
+    "Success": {
+        "success": ["Multiline", ["evaluation/success_rate", "training/success_rate"]],
+        "stages, evaluation": ["Multiline", ["evaluation/stage/.*"]],
+        "with overlap not counted": ["Multiline", ["training/success_rate", "training/raw_success_rate"]],
+    },
+    "Overlap": {"penetration [mm]": ["Multiline", ["evaluation/penetration_p95_mm", "training/penetration_mm"]]},
+    "Reward": {
+        "terms, per control step": ["Multiline", ["training/reward/.*"]],
+        "sum of an episode": ["Multiline", ["evaluation/return_mean", "training/return_mean"]],
+    },
+    "Time": {"shares": ["Multiline", ["speed/.*_share"]]},
+}
+"""Charts of the page "Custom Scalars": category, title, tags as regular expressions."""
+
 LOSSES = frozenset(tag.removeprefix("loss/") for tag in TAGS if tag.startswith("loss/"))
 """Names of the losses that have a tag."""
 
@@ -55,12 +86,21 @@ def tags_table() -> str:
 
 
 class RunLog:
-    """Writes scalars to the TensorBoard events of a run folder; x is the number of environment steps."""
+    """Writes to the TensorBoard events of a run folder; x is the number of environment steps.
 
-    def __init__(self, folder: Path, first_step: int = 0):
+    Args:
+        folder: of the run.
+        first_step: with which it goes on; at 0 the table of tags, the layout and the settings are written.
+        config: settings of the run, for the page of hyperparameters.
+    """
+
+    def __init__(self, folder: Path, first_step: int = 0, config: RunConfig | None = None):
         self._writer = SummaryWriter(str(folder), purge_step=first_step or None)
+        self._settings = {} if config is None else flat_settings(config)
         if first_step == 0:
             self._writer.add_text("tags", tags_table())
+            self._writer.add_custom_scalars(LAYOUT)
+            self._add_hyperparameters(0, 1)
 
     def add(self, prefix: str, values: Mapping[str, float], step: int) -> None:
         """Write `values` as `prefix/<name>`."""
@@ -72,6 +112,52 @@ class RunLog:
         for name, value in values.items():
             self._writer.add_scalar(f"{'loss' if name in LOSSES else 'learner'}/{name}", value, step)
 
+    def add_final(self, result: Mapping[str, Any], step: int) -> None:
+        """Write the figures of a finished run's `result.json` that stand beside its settings."""
+        for name in FINAL:
+            if result[name] is not None:
+                self._writer.add_scalar(f"final/{name}", result[name], step)
+        self._add_hyperparameters(2)
+
+    def _add_hyperparameters(self, *parts: int) -> None:
+        """Write parts of what the page of hyperparameters reads: 0 their names, 1 the values, 2 that the run ended."""
+        summaries = hparams(self._settings, {f"final/{name}": 0.0 for name in FINAL})
+        for part in parts:
+            self._writer._get_file_writer().add_summary(summaries[part])  # add_hparams makes a folder of its own
+
     def close(self) -> None:
         """Flush and close."""
         self._writer.close()
+
+
+def flat_settings(config: RunConfig) -> dict[str, str | float | bool]:
+    """Settings of a run by their names on the command line; what is no number, text or bool is written as text."""
+    flat: dict[str, str | float | bool] = {}
+
+    def add(prefix: str, values: Mapping[str, Any]) -> None:
+        for name, value in values.items():
+            if isinstance(value, Mapping):
+                add(f"{prefix}{name}.", value)
+            else:
+                flat[prefix + name] = value if isinstance(value, str | float | int | bool) else str(value)
+
+    add("", plain(config))
+    return flat
+
+
+def add_film(folder: Path, film: Path, step: int) -> None:
+    """Put a film into the TensorBoard events of a run folder, as a GIF of every second frame in half the size.
+
+    Args:
+        folder: of the run.
+        film: the file.
+        step: environment steps of its policy.
+    """
+    reader: Any = imageio.get_reader(film)
+    frames = [np.asarray(frame)[::2, ::2] for frame in itertools.islice(reader, None, None, 2)]
+    milliseconds = 2000 / reader.get_meta_data()["fps"]
+    gif: Any = imageio.mimwrite("<bytes>", frames, format="GIF", duration=milliseconds, loop=0)  # pyright: ignore
+    height, width = frames[0].shape[:2]
+    image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)
+    with SummaryWriter(str(folder)) as writer:
+        writer._get_file_writer().add_summary(Summary(value=[Summary.Value(tag=FILM, image=image)]), step)

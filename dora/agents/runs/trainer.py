@@ -125,17 +125,19 @@ class Trainer:
         evaluation, zero, finished = None, None, False
         with Interrupt() as interrupt:
             self.folder.mark_unfinished()
-            log = RunLog(self.folder.path, self.counters.env_steps)
+            log = RunLog(self.folder.path, self.counters.env_steps, self.config)
             try:
                 evaluation, zero = self._train_and_evaluate(log, interrupt)
                 finished = True
             except KeyboardInterrupt:
                 self.interrupted = interrupt.number or signal.SIGINT
             finally:
-                log.close()
                 self._evaluators.close()
                 evaluation = evaluation or self._last_evaluation
                 result = self._write_result(evaluation, zero, finished)
+                if finished:
+                    log.add_final(result, self.counters.env_steps)
+                log.close()
         return result
 
     def _train_and_evaluate(self, log: RunLog, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
@@ -258,7 +260,7 @@ class Trainer:
         self._recent = torch.cat([self._recent, ended])[-RECENT:]
         names = [name for name in self.columns.names if name != "whole"] if len(ended) else []
         means = {RENAMED.get(name, name): float(self.columns.column(ended, name).mean()) for name in names}
-        log.add("episode", means, step)
+        log.add("training", means, step)
         self._table.add({"env_steps": step, "seconds": counters.wall_seconds, "episodes": len(ended)} | means)
 
     def _evaluation_is_due(self) -> bool:
