@@ -14,13 +14,12 @@ import sys as _sys
 from pathlib import Path as _Path
 from typing import TYPE_CHECKING
 
-from dora.version import version as _version
+from dora.version import VERSION as __version__
 
 if TYPE_CHECKING:
     from dora.policies.policy import TaskPolicy
 
 __all__ = ["__version__", "load_policy"]
-__version__ = _version()
 
 
 def load_policy(which: "str | _Path") -> "TaskPolicy":

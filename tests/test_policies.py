@@ -278,7 +278,7 @@ def test_a_result_that_the_policy_does_not_reach_is_refused() -> None:
 def test_a_card_survives_its_file_and_damage_is_refused(tmp_path: Path) -> None:
     choice = chosen(find_runs(RESULTS), "DoraCube-v1")
     assert choice is not None
-    card = make_card(choice, episodes({}, {"success": 0.0}), "DoraCube-v1/run")
+    card = make_card(choice, episodes({}, {"success": 0.0}), "DoraCube-v1/run", "0123456789ab")
     card.write(tmp_path / "card.json")
     assert Card.read(tmp_path / "card.json") == card
     assert card.failures == {"too much overlap": 1}

@@ -72,6 +72,7 @@ class Choice:
 def main() -> int:
     """Run the command; returns the exit status."""
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
+    commit = source_commit()  # before files of the checkout are replaced
     try:
         runs = find_runs(args.results)
         for env_id in args.env or task_ids():
@@ -83,7 +84,7 @@ def main() -> int:
                 print(f"{env_id}: {choice.run.folder} is bundled already (--again makes its card anew).")
                 continue
             print(f"{env_id}: {choice.run.folder}, best of {choice.among}; counting what it fails at ...")
-            print(bundle(choice, args.results, args.workers))
+            print(bundle(choice, args.results, commit, args.workers))
     except InputError as error:
         print(error, file=sys.stderr)
         return BAD_INPUT
@@ -127,12 +128,13 @@ def is_bundled(choice: Choice) -> bool:
     )  # fmt: skip
 
 
-def bundle(choice: Choice, results: Path, workers: int = 1) -> Card:
+def bundle(choice: Choice, results: Path, commit: str | None, workers: int = 1) -> Card:
     """Copy a policy into the package and write its card, which is returned.
 
     Args:
         choice: what to bundle.
         results: folder below which the run lies; the card names the run from there.
+        commit: of the code that runs.
         workers: processes that evaluate.
 
     Raises:
@@ -145,7 +147,7 @@ def bundle(choice: Choice, results: Path, workers: int = 1) -> Card:
     first_seed = result.get("first_seed") or FINAL_SEED
     _, evaluation, _ = evaluate_checkpoint(choice.path, settings, make, zero=False, first_seed=first_seed)
     check_agrees(evaluation, choice.run)
-    card = make_card(choice, evaluation, os.path.relpath(choice.run.folder, results))
+    card = make_card(choice, evaluation, os.path.relpath(choice.run.folder, results), commit)
     policy, card_file = bundled_files(config.env)
     make_folder(policy.parent)
     write_bytes(policy, choice.path.read_bytes())
@@ -167,13 +169,14 @@ def check_agrees(evaluation: Evaluation, run: Run) -> None:
         )
 
 
-def make_card(choice: Choice, evaluation: Evaluation, run: str) -> Card:
+def make_card(choice: Choice, evaluation: Evaluation, run: str, commit: str | None) -> Card:
     """The card of a policy.
 
     Args:
         choice: the run.
         evaluation: in which its failures are counted.
         run: how the card calls the run.
+        commit: of the code that counted them.
     """
     result, config, progress = choice.run.result, choice.checkpoint.config, choice.checkpoint.progress
     task = find_task(config.env)
@@ -200,7 +203,7 @@ def make_card(choice: Choice, evaluation: Evaluation, run: str) -> Card:
         failures=failure_causes(evaluation, task.MAX_STEPS),
         run=run,
         run_commit=result.get("commit"),
-        commit=source_commit(),
+        commit=commit,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
     )
 
