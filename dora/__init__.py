@@ -6,14 +6,35 @@ with ManiSkill, and adds `sim_backend="physx_cpu_batch"` to all tasks:
     import gymnasium as gym, dora
     env = gym.make("DoraCube-v1", num_envs=32, sim_backend="physx_cpu_batch", guidance="affordance")
     env = gym.make("Empty-v1", robot_uids="diana7_hit")
+
+A trained policy comes with each task: `action = dora.load_policy("DoraCube-v1")(obs)`.
 """
 
 import sys as _sys
 from pathlib import Path as _Path
+from typing import TYPE_CHECKING
 
-from dora.version import version as _version
+from dora.version import VERSION as __version__
 
-__version__ = _version()
+if TYPE_CHECKING:
+    from dora.policies.policy import TaskPolicy
+
+__all__ = ["__version__", "load_policy"]
+
+
+def load_policy(which: "str | _Path") -> "TaskPolicy":
+    """A trained, greedy policy: `action = policy(obs)` for observations (o,) or (n, o), arrays or tensors.
+
+    Args:
+        which: a task id such as "DoraHammer-v1", for the policy that comes with Dora; or the path of a run folder, for
+            its best policy, or of a .safetensors file.
+
+    Raises:
+        InputError: for an unknown id, a task without a policy, or a file that is no checkpoint.
+    """
+    from dora.policies.policy import load_policy as load  # learners are imported only when one is wanted
+
+    return load(which)
 
 
 def _is_command() -> bool:

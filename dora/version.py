@@ -1,6 +1,5 @@
 """Which Dora this is: the version of the package and the commit that it was made from."""
 
-import importlib.metadata
 import subprocess
 from pathlib import Path
 
@@ -9,15 +8,10 @@ PACKAGE = Path(__file__).parent
 COMMIT_FILE = "_commit"
 """File in the package that names the commit; only a built wheel has it."""
 NAME = "dora"
-"""Name of the distribution."""
-
-
-def version() -> str:
-    """Version of the installed distribution; "unknown" for a copy of the sources that is not installed."""
-    try:
-        return importlib.metadata.version(NAME)
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"
+"""Name of the package and of its command; that of the distribution is in pyproject.toml, because another project has
+this one on the index."""
+VERSION = "0.1.0"
+"""Version of the package; pyproject.toml takes it from here."""
 
 
 def source_commit(package: Path = PACKAGE) -> str | None:
@@ -41,4 +35,4 @@ def described(root: Path) -> str | None:
 def version_line() -> str:
     """Version and commit for people, such as "dora 0.1.0 (commit 0123456789ab)"."""
     commit = source_commit()
-    return f"{NAME} {version()}" + (f" (commit {commit})" if commit else "")
+    return f"{NAME} {VERSION}" + (f" (commit {commit})" if commit else "")

@@ -13,13 +13,15 @@ LEVELS = {
     "affordance.reach": 8, "affordance.views": 9,
     "sim.batch": 10, "sim": 11, "sim.grasp_tests": 12,
     "tasks.mdp": 13, "tasks.guidance": 14, "tasks.env": 15, "tasks.hammer": 16, "tasks": 17,
-    "registration": 18, "tools": 18, "commands": 19, "__main__": 20,
+    "registration": 18, "tools": 18, "policies": 18.5, "commands": 19, "__main__": 20,
 }  # fmt: skip
 """A room may import itself and rooms of a lower level; a room inside one that is not listed belongs to it."""
 LEARNERS = {
     "agents": 0, "agents.learners": 1, "agents.collecting": 2, "agents.evaluation": 3, "agents.runs": 4
 }  # fmt: skip
-"""The same for learners, who know of the rest only what stands below level 1; commands know them."""
+"""The same for learners, who know of the rest only what stands below level 1; policies and commands know them."""
+KNOW_LEARNERS = ("policies", "commands")
+"""Rooms that know tasks and learners."""
 FORBIDDEN = {
     "robot": ("sapien", "mani_skill", "torchrl"),
     "geometry": ("sapien", "mani_skill", "torchrl"),
@@ -68,7 +70,7 @@ def allowed(here: str, there: str) -> bool:
     if here in LEARNERS:
         return LEVELS[there] < 1
     if there in LEARNERS:
-        return here == "commands"
+        return here in KNOW_LEARNERS
     return LEVELS[there] < LEVELS[here] or here == there
 
 

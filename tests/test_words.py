@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MODULES = sorted((ROOT / "dora").rglob("*.py"))
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FEWEST_WORDS = 4
 """Words of a first line that says what lives in a module."""
 UNIT = r"(?:m|mm|cm|km|rad|deg|kg|g|s|ms|us|N|Hz|J|W|pixels|points|kg/m\^3)(?:\^\d)?"

@@ -21,10 +21,10 @@ from dora.configs import plain
 from dora.errors import InputError
 from dora.files import write_bytes, write_csv, write_json
 from dora.reading import read_yaml
-from dora.version import source_commit
+from dora.version import VERSION, source_commit
 
-PACKAGES = ("dora", "mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
-"""Packages whose versions are written."""
+PACKAGES = ("mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
+"""Packages whose versions are written besides that of Dora."""
 OWN_FILES = ("config.yaml", "result.json", "curve.csv", "eval.csv", "progress.csv", "checkpoints/latest.safetensors",
              "checkpoints/best.safetensors")  # fmt: skip
 """Files by which a folder is known to hold a run."""
@@ -256,6 +256,7 @@ def steps_to(success: float, curve: list[list[Any]]) -> int | None:
 def _versions() -> str:
     lines = [f"python {platform.python_version()}", f"platform {platform.platform()}"]
     lines += [f"commit {commit}"] if (commit := source_commit()) else []
+    lines += [f"dora {VERSION}"]
     for name in PACKAGES:
         try:
             lines.append(f"{name} {importlib.metadata.version(name)}")

@@ -1,12 +1,19 @@
 """Whether this machine can render, and stand-ins for the materials that tasks make even where nothing can."""
 
+import multiprocessing
 from functools import cache
 from typing import Any
 
 import sapien
+from mani_skill import logger
 from mani_skill.utils.building import _mjcf_loader
 from sapien import pysapien
 from sapien.wrapper import urdf_loader
+
+QUIET, USUAL = "off", "warn"
+"""Levels of SAPIEN's log of rendering: nothing, and what it is when SAPIEN is imported."""
+NOTE = "There is no Vulkan driver: everything works but pictures and films (docs/rendering.md says how to get one)."
+"""What is said once instead of the three lines that SAPIEN logs where it finds no driver."""
 
 
 class NoMaterial:
@@ -27,12 +34,21 @@ class NoMaterial:
 
 @cache
 def can_render() -> bool:
-    """Whether SAPIEN finds a Vulkan driver; asked once per process, in about half a second. Changes nothing."""
+    """Whether SAPIEN finds a Vulkan driver; asked once per process, in about half a second.
+
+    Where there is none, `NOTE` is logged, but not in worker processes. Changes nothing but the level of SAPIEN's log of
+    rendering, which is afterwards what it is when SAPIEN is imported.
+    """
+    sapien.render.set_log_level(QUIET)
     try:
         # The render system must come before any material: SAPIEN binds to the device of the first it meets.
         sapien.render.RenderSystem(sapien.Device("cpu"))
     except RuntimeError:
+        if multiprocessing.parent_process() is None:
+            logger.warning(NOTE)
         return False
+    finally:
+        sapien.render.set_log_level(USUAL)
     return True
 
 

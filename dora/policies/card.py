@@ -1,0 +1,167 @@
+"""What is known of a bundled policy: where it comes from, how often it succeeds, and what it fails at."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dora.agents.evaluation.evaluate import Evaluation
+from dora.agents.evaluation.intervals import share_text
+from dora.configs import built, check_finite, plain
+from dora.errors import InputError
+from dora.files import write_json
+from dora.reading import read_json
+from dora.tables import text_table
+
+MOST = 100_000
+"""Size of a card above which it is not read [bytes]."""
+SECONDS_PER_MINUTE = 60.0
+"""Seconds in a minute [s]."""
+HEADINGS = (
+    "task", "agent", "preset", "steps", "seed", "success %", "scripted (zero correction) %", "overlap p95 mm",
+    "what it fails at",
+)  # fmt: skip
+"""Of a table of cards."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Card:
+    """Figures of one policy; all are read or counted by `python -m dora.policies.bundle`, none is typed."""
+
+    env: str
+    """Task id."""
+    agent: str
+    """Learner."""
+    guidance: str
+    """Guidance that it was trained and evaluated with."""
+    preset: str
+    """How much the episodes were randomised."""
+    seed: int
+    """Seed of the run."""
+    env_steps: int
+    """Environment steps after which this policy was kept."""
+    total_steps: int
+    """Budget of the run in environment steps."""
+    minutes: float
+    """Wall time of the run [min]."""
+    chosen_among: int
+    """Runs of the task among which its evaluation during training chose this one [1]."""
+    training_success: float
+    """Success rate of that evaluation."""
+    training_episodes: int
+    """Its episodes."""
+    success_rate: float
+    """Success rate on other starts, which neither trained nor chose the policy."""
+    success_interval: tuple[float, float]
+    """Wilson's 95 % interval of it."""
+    zero_success_rate: float | None
+    """Success rate of zero correction on the same starts, if it was measured."""
+    episodes: int
+    """Those starts."""
+    first_seed: int
+    """Seed of the first of them; the others follow."""
+    overlap_p95_mm: float | None
+    """95th percentile over these episodes of the largest overlap [mm]."""
+    overlap_limit_mm: float
+    """Overlap above which an episode is no success [mm]."""
+    stage_rates: dict[str, float]
+    """Share of these episodes in which each stage was done."""
+    counted_successes: int
+    """Successes when the failures were counted, in as many episodes of the same starts."""
+    failures: dict[str, int]
+    """Failed episodes by what went wrong first; together with the successes they are all episodes."""
+    run: str
+    """Folder of the run, below the folder of results."""
+    run_commit: str | None
+    """Commit that made its result."""
+    commit: str | None
+    """Commit that counted the failures and made this card."""
+    date: str
+    """Day on which it was made."""
+
+    def write(self, path: Path) -> None:
+        """Write it as JSON, atomically."""
+        write_json(path, plain(self))
+
+    @classmethod
+    def read(cls, path: Path) -> "Card":
+        """A card as `write` wrote it.
+
+        Raises:
+            InputError: if it is missing, too large, or has other entries.
+        """
+        content = read_json(path, "card", MOST)
+        if not isinstance(content, dict):
+            raise InputError(f"{path} is no card of a policy: make it again by python -m dora.policies.bundle.")
+        card = built(cls, content, f"the card {path}")
+        check_finite(card, f"the card {path}")
+        return card
+
+    @property
+    def failures_text(self) -> str:
+        """What it fails at as shares of all episodes, the most frequent first."""
+        most = sorted(self.failures.items(), key=lambda item: -item[1])
+        found = [f"{cause} {100 * count / self.episodes:.1f} %" for cause, count in most]
+        return ", ".join(found) or "nothing in these episodes"
+
+    def row(self) -> list[str]:
+        """Cells under `HEADINGS`."""
+        zero, overlap = self.zero_success_rate, self.overlap_p95_mm
+        return [
+            self.env, self.agent.upper(), self.preset, f"{self.env_steps / 1000:.0f}k", str(self.seed),
+            share_text(self.success_rate, self.episodes, 100.0, 1), "-" if zero is None else f"{100 * zero:.1f}",
+            "-" if overlap is None else f"{overlap:.1f} (limit {self.overlap_limit_mm:g})", self.failures_text,
+        ]  # fmt: skip
+
+    def __str__(self) -> str:
+        """The card as a table of two columns."""
+        rows = [["guidance", self.guidance], *map(list, zip(HEADINGS, self.row(), strict=True))]
+        stages = ", ".join(f"{name} {100 * rate:.1f} %" for name, rate in self.stage_rates.items())
+        training = f"{self.training_success:.2f} of {self.training_episodes} episodes, best of {self.chosen_among} runs"
+        rows += [
+            ["starts", f"{self.episodes}, seeds from {self.first_seed}"], ["stages done", stages],
+            ["chosen by training", training], ["training", f"{self.minutes:.1f} minutes"],
+            ["run", f"{self.run} ({self.run_commit or 'unknown commit'})"],
+            ["card made", f"{self.date} ({self.commit or 'unknown commit'})"],
+        ]  # fmt: skip
+        return text_table(["what", "value"], rows)
+
+
+def failure_causes(evaluation: Evaluation, max_steps: int) -> dict[str, int]:
+    """Failed episodes by the first cause that applies; a cause without episodes is left out.
+
+    Args:
+        evaluation: of the policy.
+        max_steps: of an episode that is not ended by a failure [control steps].
+    """
+    columns = evaluation.columns
+    stages = [name for name in columns.highest if name.startswith("stage/")]
+
+    def has(name: str) -> Any:
+        known = name in columns.names
+        return evaluation.values(name) > 0 if known else evaluation.values("success") < 0
+
+    early = evaluation.values("length") < max_steps
+    causes: dict[str, Any] = {
+        "the simulation was not finite": has("nonfinite"),
+        "no grasp within reach": has("unreachable"),
+        "too much overlap": has("raw_success"),
+        **_undone(stages, has, early),
+        "lost again at the end": ~has("success"),
+    }
+    left, counts = ~has("success"), {}
+    for cause, applies in causes.items():
+        found = int((left & applies).sum())
+        counts |= {cause: found} if found else {}
+        left &= ~applies
+    return counts
+
+
+def _undone(stages: Sequence[str], has: Any, early: Any) -> dict[str, Any]:
+    """Episodes in which each stage is the first that was not done: ended by the task's test of failure, or by time."""
+    found = {}
+    for stage in stages:
+        name = stage.removeprefix("stage/")
+        found[f"object lost before {name}"] = ~has(stage) & early
+        found[f"{name} not done in time"] = ~has(stage)
+    return found

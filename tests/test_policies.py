@@ -1,0 +1,293 @@
+"""Policies that come with Dora: chosen by training, used on observations of `gym.make`, and what their cards say."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import dora
+from dora.agents.checkpoint import read_checkpoint
+from dora.agents.collecting.task_env import EpisodeColumns
+from dora.agents.evaluation.evaluate import Evaluation
+from dora.agents.evaluation.intervals import wilson
+from dora.agents.runs.run_results import find_runs
+from dora.errors import InputError
+from dora.policies.bundle import PAGE, cards_table, check_agrees, chosen, is_bundled, make_card
+from dora.policies.card import Card, failure_causes
+from dora.policies.policy import bundled_files, bundled_ids, load_policy
+from dora.tasks import task_ids
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "results" / "tasks"
+CARDS = [env_id for env_id in bundled_ids() if bundled_files(env_id)[1].is_file()]
+STARTS, FEWEST = 8, 6
+"""Episodes of the check of a policy, and how many of them have to succeed [1]."""
+
+
+def observation(env_id: str, rows: int = 3) -> np.ndarray:
+    size = load_policy(env_id).observation_size
+    return np.random.default_rng(0).normal(size=(rows, size)).astype(np.float32)
+
+
+def test_every_task_has_a_policy_and_every_policy_a_card() -> None:
+    assert bundled_ids() == task_ids()
+    assert task_ids() == CARDS
+
+
+def test_the_package_names_what_it_offers() -> None:
+    assert {"load_policy", "__version__"} <= set(dora.__all__)
+    assert all(hasattr(dora, name) for name in dora.__all__)
+
+
+def test_importing_dora_imports_no_learner() -> None:
+    code = "import sys, dora; print({'torchrl', 'tensordict', 'dora.policies', 'dora.agents'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "set()"
+
+
+@pytest.mark.parametrize("env_id", bundled_ids())
+def test_arrays_and_tensors_single_and_batched_give_the_same_actions(env_id: str) -> None:
+    policy, batch = dora.load_policy(env_id), observation(env_id)
+    actions = policy(batch)
+    assert isinstance(actions, np.ndarray)
+    assert actions.shape == (3, policy.action_size)
+    assert np.abs(actions).max() <= 1
+    as_tensor = policy(torch.from_numpy(batch))
+    assert isinstance(as_tensor, torch.Tensor)
+    assert np.array_equal(as_tensor.numpy(), actions)
+    assert policy(batch[1].tolist()).shape == (policy.action_size,)
+    np.testing.assert_allclose(policy(batch[1].astype(np.float64)), actions[1], atol=1e-5)
+    assert np.array_equal(policy(batch), actions), "it is greedy"
+
+
+def test_the_action_is_that_of_evaluation_clipped() -> None:
+    policy, batch = dora.load_policy("DoraCube-v1"), 20 * observation("DoraCube-v1", 64)
+    bare = policy._networks.greedy(torch.from_numpy(batch)).numpy()
+    assert np.abs(bare).max() > 1, "the observations are such that something is clipped"
+    assert np.array_equal(policy(batch), bare.clip(-1, 1))
+
+
+def test_numbers_that_are_not_finite_count_as_zero() -> None:
+    policy, batch = dora.load_policy("DoraCube-v1"), observation("DoraCube-v1")
+    bad, zero = batch.copy(), batch.copy()
+    bad[0, :2], zero[0, :2] = (np.nan, np.inf), 0.0
+    assert np.array_equal(policy(bad), policy(zero))
+
+
+@pytest.mark.parametrize(
+    ("obs", "said"),
+    [
+        (np.zeros(7), "takes (211,)"),
+        (np.zeros((2, 3, 211)), "(2, 3, 211)"),
+        (torch.zeros(()), "()"),
+        ({"state": np.zeros(211)}, "not a dict"),
+        ((np.zeros(211), {}), "not a tuple"),
+        (["a"], "an array of numbers"),
+    ],
+)
+def test_an_observation_that_does_not_fit_is_refused_with_a_remedy(obs: object, said: str) -> None:
+    with pytest.raises(InputError, match=r"policy\.make") as refusal:
+        dora.load_policy("DoraCube-v1")(obs)
+    assert said in str(refusal.value)
+
+
+def test_wrong_ids_and_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="did you mean DoraCube-v1"):
+        dora.load_policy("DoraCub-v1")
+    with pytest.raises(InputError, match="a task id or a path"):
+        dora.load_policy(3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="checkpoint"):
+        dora.load_policy(tmp_path / "policy.safetensors")
+
+
+def test_a_run_of_ones_own_is_loaded_by_its_path(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").mkdir()
+    bundled = bundled_files("DoraCube-v1")[0]
+    (tmp_path / "checkpoints" / "best.safetensors").write_bytes(bundled.read_bytes())
+    batch = observation("DoraCube-v1")
+    for place in (tmp_path, str(tmp_path), bundled):
+        mine = dora.load_policy(place)
+        assert mine.card is None
+        assert np.array_equal(mine(batch), dora.load_policy("dora:DoraCube-v1")(batch))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({}, None),
+        ({"preset": "hard", "config": {"lift": 0.12}}, None),
+        ({"guidance": "none"}, "guidance 'affordance', and the environment has 'none'"),
+        ({"guidance": "grasps"}, "has 'grasps'"),
+        ({"guidance_parts": ["prior"]}, "has 'affordance (prior alone)'"),
+        ({"hand_joints": 15}, "control mode"),
+        ({"config": {"residual": {"joint": 0.2}}}, r"config\.residual"),
+        ({"config": {"optimised": True}}, r"config\.optimised False"),
+    ],
+)
+def test_an_environment_of_another_kind_is_refused(options: dict, said: str | None) -> None:
+    policy, env = dora.load_policy("DoraCube-v1"), gym.make("DoraCube-v1", **options)
+    if said is None:
+        policy.check(env)
+        policy(env.reset(seed=0)[0])
+    else:
+        with pytest.raises(InputError, match=said):
+            policy.check(env)
+    env.close()
+
+
+def test_an_environment_of_another_task_is_refused() -> None:
+    env = gym.make("DoraJug-v1")
+    with pytest.raises(InputError, match="is of DoraCube-v1, not of DoraJug-v1"):
+        dora.load_policy("DoraCube-v1").check(env)
+    env.close()
+
+
+def test_the_environment_that_a_policy_makes_fits_it() -> None:
+    policy = dora.load_policy("DoraCube-v1")
+    env = policy.make(2, sim_backend="physx_cpu_batch")
+    policy.check(env)
+    obs, _ = env.reset(seed=[3, 4])
+    assert policy(obs).shape == (2, 26)
+    assert env.unwrapped.config.fewest_lifts == policy.config.task["fewest_lifts"]  # pyright: ignore[reportAttributeAccessIssue]
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", ["DoraCube-v1", pytest.param("DoraHammer-v1", marks=pytest.mark.slow),
+                                    pytest.param("DoraJug-v1", marks=pytest.mark.slow)])  # fmt: skip
+def test_a_policy_succeeds_in_the_environment_of_gym_make(env_id: str) -> None:
+    """On starts that no training, evaluation or card uses."""
+    policy, env = dora.load_policy(env_id), gym.make(env_id, num_envs=STARTS, sim_backend="physx_cpu_batch")
+    obs, info = env.reset(seed=[77_000 + k for k in range(STARTS)])
+    for _ in range(env.unwrapped.max_steps):  # pyright: ignore[reportAttributeAccessIssue]
+        obs, _, _, _, info = env.step(policy(obs))
+    assert int(info["success"].sum()) >= FEWEST
+    env.close()
+
+
+# ----------------------------------------------------------------------- cards
+
+
+@pytest.mark.parametrize("env_id", CARDS)
+def test_a_card_agrees_with_the_run_that_it_names(env_id: str) -> None:
+    policy, path = bundled_files(env_id)
+    card = Card.read(path)
+    run = RESULTS / card.run
+    result = json.loads((run / "result.json").read_text())
+    assert (run / "policy.safetensors").read_bytes() == policy.read_bytes()
+    assert card.success_rate == result["success_rate"]
+    assert list(card.success_interval) == pytest.approx(result["success_interval"])
+    assert card.overlap_p95_mm == result["penetration_p95_mm"]
+    assert card.stage_rates == result["stage_rates"]
+    assert card.counted_successes + sum(card.failures.values()) == card.episodes == result["eval_episodes"]
+    low, high = wilson(card.counted_successes, card.episodes)
+    assert low <= card.success_rate <= high
+    assert card.commit
+    for word in (card.env, card.run, card.date, str(card.seed)):
+        assert word in str(card)
+
+
+@pytest.mark.parametrize("env_id", task_ids())
+def test_the_bundled_policy_is_the_one_that_training_evaluated_best(env_id: str) -> None:
+    """Whatever its success on the starts of the table is."""
+    choice = chosen(find_runs(RESULTS), env_id)
+    assert choice is not None
+    assert is_bundled(choice)
+
+
+def test_the_best_evaluation_during_training_is_chosen_and_not_the_best_result(tmp_path: Path) -> None:
+    """The runs' results are turned round: the choice stays."""
+    runs = find_runs(RESULTS)
+    choice = chosen(runs, "DoraCube-v1")
+    assert choice is not None
+    turned = [
+        dataclasses.replace(run, result=run.result | {"success_rate": 1 - run.result["success_rate"]}) for run in runs
+    ]
+    again = chosen(turned, "DoraCube-v1")
+    assert again is not None
+    assert again.run.folder == choice.run.folder
+    best = [
+        read_checkpoint(run.folder / "policy.safetensors").progress["best"]
+        for run in runs
+        if "ppo-affordance-s" in str(run.folder)
+    ]
+    assert choice.checkpoint.progress["best"] == max(best)
+    assert choice.among == len(best)
+
+
+def test_a_run_that_was_only_evaluated_again_comes_last() -> None:
+    runs = find_runs(RESULTS)
+    choice = chosen(runs, "DoraCube-v1")
+    assert choice is not None
+    marked = [
+        dataclasses.replace(run, result=run.result | {"checkpoint": "x"}) if run is choice.run else run for run in runs
+    ]
+    other = chosen(marked, "DoraCube-v1")
+    assert other is not None
+    assert other.run.folder != choice.run.folder
+
+
+COLUMNS = EpisodeColumns.of(
+    ("stage/reach", "stage/lift", "penetration_mm", "raw_success", "success_at_end", "nonfinite", "unreachable")
+)
+
+
+def episodes(*rows: dict[str, float]) -> Evaluation:
+    """An evaluation of such episodes; what is not given is that of a success."""
+    usual = {"success": 1.0, "raw_success": 1.0, "whole": 1.0, "length": 100.0, "stage/reach": 1.0, "stage/lift": 1.0}
+    table = torch.tensor([[(usual | row).get(name, 0.0) for name in COLUMNS.names] for row in rows])
+    return Evaluation(COLUMNS, table)
+
+
+def test_failures_are_counted_by_the_first_cause() -> None:
+    lost = {"success": 0.0, "raw_success": 0.0}
+    found = failure_causes(
+        episodes(
+            {},
+            {"success": 0.0, "penetration_mm": 9.0},
+            {"success": 0.0, "penetration_mm": 4.0},
+            {**lost, "stage/lift": 0.0},
+            {**lost, "stage/lift": 0.0, "length": 50.0},
+            {**lost, "stage/reach": 0.0, "stage/lift": 0.0},
+            {**lost, "stage/reach": 0.0, "stage/lift": 0.0, "nonfinite": 1.0, "length": 9.0},
+            {**lost, "stage/reach": 0.0, "stage/lift": 0.0, "unreachable": 1.0, "length": 1.0},
+            {**lost, "length": 90.0},
+        ),
+        100,
+    )
+    assert found == {
+        "the simulation was not finite": 1, "no grasp within reach": 1, "too much overlap": 2,
+        "object lost before lift": 1, "lift not done in time": 1, "reach not done in time": 1,
+        "lost again at the end": 1,
+    }  # fmt: skip
+
+
+def test_a_result_that_the_policy_does_not_reach_is_refused() -> None:
+    choice = chosen(find_runs(RESULTS), "DoraCube-v1")
+    assert choice is not None
+    with pytest.raises(InputError, match="dora run --eval-only"):
+        check_agrees(episodes(*[{"success": 0.0}] * 50), choice.run)
+    check_agrees(episodes(*[{}] * 49, {"success": 0.0}), choice.run)
+
+
+def test_a_card_survives_its_file_and_damage_is_refused(tmp_path: Path) -> None:
+    choice = chosen(find_runs(RESULTS), "DoraCube-v1")
+    assert choice is not None
+    card = make_card(choice, episodes({}, {"success": 0.0}), "DoraCube-v1/run", "0123456789ab")
+    card.write(tmp_path / "card.json")
+    assert Card.read(tmp_path / "card.json") == card
+    assert card.failures == {"too much overlap": 1}
+    content = json.loads((tmp_path / "card.json").read_text())
+    for damaged in (content | {"seed": "one"}, {k: v for k, v in content.items() if k != "seed"}, [content]):
+        (tmp_path / "card.json").write_text(json.dumps(damaged))
+        with pytest.raises(InputError, match="card"):
+            Card.read(tmp_path / "card.json")
+
+
+def test_the_page_has_the_table_of_the_cards() -> None:
+    assert cards_table() in (ROOT / PAGE).read_text()
