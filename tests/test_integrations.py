@@ -1,0 +1,109 @@
+"""Batches as environments of other libraries: TorchRL and Stable-Baselines3."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from torchrl.collectors import Collector
+from torchrl.envs.utils import check_env_specs
+
+from dora.errors import InputError
+from dora.integrations.batches import make_batch
+from dora.integrations.torchrl import make as make_torchrl
+
+LIMIT, COUNT = 6, 3
+"""Length of an episode [control steps]; number of environments."""
+IDS = ("DoraCube-v1", "PickCube-v1")
+
+
+def test_a_batch_needs_arrays():
+    with pytest.raises(InputError, match='choose obs_mode="state"'):
+        make_batch("PickCube-v1", 2, {"obs_mode": "state_dict"})
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_torchrl_collects_from_it(env_id: str):
+    env = make_torchrl(env_id, COUNT, max_episode_steps=LIMIT)
+    check_env_specs(env)
+    frames = 4 * LIMIT * COUNT
+    batch = next(iter(Collector(env, None, frames_per_batch=frames, total_frames=frames)))
+    done = batch["next", "done"][..., 0]
+    assert batch.shape == (COUNT, 4 * LIMIT)
+    assert done.sum(1).tolist() == [4] * COUNT
+    assert torch.equal(batch["next", "truncated"], batch["next", "done"])
+    assert torch.isfinite(batch["observation"]).all()
+    went_on = ~done[:, :-1]
+    assert torch.equal(batch["observation"][:, 1:][went_on], batch["next", "observation"][:, :-1][went_on])
+    began = batch["observation"][:, 1:][done[:, :-1]]
+    assert not torch.equal(began, batch["next", "observation"][:, :-1][done[:, :-1]])
+    env.close()
+
+
+def test_torchrl_sees_what_gymnasium_sees():
+    env = make_torchrl("DoraCube-v1", COUNT)
+    env.set_seed(5)
+    after = env.step(env.reset().set("action", torch.full((COUNT, 26), 0.5)))["next"]
+    bare: Any = make_batch("DoraCube-v1", COUNT, {})
+    bare.reset(seed=5)
+    obs, reward, _, _, info = bare.step(torch.full((COUNT, 26), 0.5))
+    assert torch.equal(after["observation"], obs)
+    assert torch.equal(after["reward"][:, 0], reward)
+    assert torch.equal(after["success"][:, 0], info["success"])
+    partly = env.reset(after.clone().set("_reset", torch.tensor([[True], [False], [False]])))
+    assert torch.equal(partly["observation"][1:], obs[1:])
+    assert not torch.equal(partly["observation"][0], obs[0])
+    env.close()
+    bare.close()
+
+
+@pytest.fixture
+def sb3() -> Any:
+    return pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_a_vecenv_ends_and_begins_episodes(sb3: Any, env_id: str):
+    from dora.integrations.sb3 import make
+
+    env: Any = make(env_id, COUNT, max_episode_steps=LIMIT)
+    env.seed(3)
+    first, ended = env.reset(), 0
+    for step in range(2 * LIMIT):
+        obs, reward, done, infos = env.step(np.zeros((COUNT, *env.action_space.shape)))
+        assert obs.shape == first.shape
+        assert reward.shape == done.shape == (COUNT,)
+        assert done.all() == done.any() == ((step + 1) % LIMIT == 0)
+        for row, info in enumerate(infos):
+            assert ("terminal_observation" in info) == ("is_success" in info) == ("episode" in info) == done[row]
+            if done[row]:
+                assert info["TimeLimit.truncated"]
+                assert info["episode"]["l"] == LIMIT
+                assert not np.array_equal(info["terminal_observation"], obs[row])
+                ended += 1
+    assert ended == 2 * COUNT
+    assert env.get_attr("control_freq", [0, 2]) == [20, 20]
+    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False] * COUNT
+    env.env_method("get_state")
+    with pytest.raises(ValueError, match="leave indices out"):
+        env.set_attr("x", 1, [0])
+    env.seed(3)
+    assert np.array_equal(env.reset(), first)
+    env.close()
+
+
+def test_stable_baselines_learns_and_evaluates_on_it(sb3: Any):
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    from dora.integrations.sb3 import make
+
+    env = make("DoraCube-v1", COUNT, max_episode_steps=LIMIT)
+    model = sb3.PPO("MlpPolicy", env, n_steps=2 * LIMIT, batch_size=8, n_epochs=1, device="cpu")
+    model.learn(4 * LIMIT * COUNT)
+    assert len(model.ep_info_buffer) == 4 * COUNT
+    assert all(np.isscalar(episode["r"]) for episode in model.ep_info_buffer)
+    returns, lengths = evaluate_policy(model, env, n_eval_episodes=4, return_episode_rewards=True)
+    assert lengths == [LIMIT] * 4
+    assert np.isfinite(returns).all()
+    env.close()
