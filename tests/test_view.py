@@ -22,7 +22,8 @@ from websockets.typing import Subprotocol
 
 from dora.affordance.bundled_sets import bundled_path
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.hand_mesh import HandMesh, joined
+from dora.affordance.hand.hand_mesh import HandMesh
+from dora.affordance.hand.link_meshes import joined
 from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.palette import PALETTE
@@ -32,6 +33,7 @@ from dora.affordance.views.album import chosen
 from dora.affordance.views.page import CONTACTS, VALID, Filter, GraspPage, describe
 from dora.affordance.views.pictures import PARTS, TILE, best_view
 from dora.affordance.views.rasteriser import Camera, seen
+from dora.affordance.views.server import start_server
 from dora.affordance.views.surface import EDGE, Surface
 from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion
@@ -235,13 +237,13 @@ def test_messages_are_unpacked_with_every_part_that_is_compressed():
 def test_a_busy_port_is_refused(page: GraspPage):
     port = page.server.get_port()
     with pytest.raises(InputError, match=f"Port {port} is in use"):
-        viewing.start_server("127.0.0.1", port, "second")
+        start_server("127.0.0.1", port, "second")
 
 
 def test_without_viser(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match=r"pip install 'dora\[view\]'"):
-        viewing.start_server("127.0.0.1", 8080, "none")
+        start_server("127.0.0.1", 8080, "none")
 
 
 @pytest.fixture(scope="module")
