@@ -23,8 +23,8 @@ from websockets.typing import Subprotocol
 from dora.affordance.bundled_sets import bundled_path
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand.hand_mesh import HandMesh
-from dora.affordance.hand.link_meshes import joined
 from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.hand.link_meshes import joined
 from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.palette import PALETTE
 from dora.affordance.views import album, pictures

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from dora.configs import plain
@@ -26,7 +25,7 @@ class Player:
     Attributes:
         name: as a page shows it.
         options: arguments with which its task is made; without a preset that of the session is in force.
-        act: gives the action; None for a recording.
+        act: gives the action; None for a recording, and for zero correction.
         recording: what is played; None for a policy.
     """
 
@@ -46,14 +45,9 @@ class Player:
         return options
 
 
-def zero_correction(action_size: int, options: Mapping[str, Any]) -> Player:
-    """The zero action, which executes the reference where actions are residuals.
-
-    Args:
-        action_size: components of an action.
-        options: arguments of the task.
-    """
-    return Player(ZERO, options, lambda observation: torch.zeros(len(observation), action_size))
+def zero_correction(options: Mapping[str, Any]) -> Player:
+    """The zero action, which executes the reference where actions are residuals; `options` are those of its task."""
+    return Player(ZERO, options)
 
 
 def recorded(recording: Recording) -> Player:

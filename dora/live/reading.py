@@ -62,7 +62,7 @@ class Reader:
         step = env.control_freq if env.task.CONTACT_EVERY_STEP else env.sim_freq
         self._frequency = float(step)
 
-    def poses(self) -> dict[str, dict[Any, Float[np.ndarray, "7"]]]:
+    def poses(self) -> dict[str, dict[Any, Float[np.ndarray, " 7"]]]:
         """World poses of links, objects and fixtures."""
         groups = {"links": self._links, "objects": self._objects, "fixtures": self._fixtures}
         return {name: {key: _pose(body) for key, body in bodies.items()} for name, bodies in groups.items()}
@@ -98,7 +98,7 @@ def _bodies(members: dict[Any, Any]) -> dict[Any, Any]:
     return {key: member._bodies[0].entity for key, member in members.items()}
 
 
-def _pose(entity: Any) -> Float[np.ndarray, "7"]:
+def _pose(entity: Any) -> Float[np.ndarray, " 7"]:
     pose = entity.pose
     return np.concatenate([pose.p, pose.q])
 

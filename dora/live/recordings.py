@@ -76,7 +76,8 @@ class Recording:
             raise InputError(f"{index_path} is no index of a ManiSkill recording: name the .h5 file of one.")
         env_id = info["env_id"].removeprefix(PREFIX)
         check_task_id(env_id)
-        kwargs = info.get("env_kwargs") if isinstance(info.get("env_kwargs"), dict) else {}
+        kwargs: Any = info.get("env_kwargs")
+        kwargs = kwargs if isinstance(kwargs, dict) else {}
         names = tuple(_named(episode, index_path) for episode in episodes)
         if not names:
             raise InputError(f"{path} has no episode: record one that succeeds.")

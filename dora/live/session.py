@@ -167,12 +167,15 @@ class Session:
     def _obey(self, pause: float) -> None:
         """Carries out the orders that are there, after waiting for the first one for `pause` [s] at most."""
         try:
-            order = self._orders.get(timeout=pause) if pause > 0 else self._orders.get_nowait()
-            while True:
-                self._carry_out(order)
-                order = self._orders.get_nowait()
+            orders = [self._orders.get(timeout=pause) if pause > 0 else self._orders.get_nowait()]
+            while not self._orders.empty():
+                orders.append(self._orders.get_nowait())
         except queue.Empty:
             return
+        starts = [order for order in orders if isinstance(order, Start)]
+        for order in orders:
+            if not isinstance(order, Start) or order is starts[-1]:  # of a slider that moves only the last place counts
+                self._carry_out(order)
 
     def _carry_out(self, order: Order) -> None:
         self._message = ""

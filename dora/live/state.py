@@ -52,7 +52,7 @@ class Setup:
 class Goal:
     """What the chosen candidate of an arm asks for: wrist pose in the world (7,) [m, wxyz], and hand joints [rad]."""
 
-    wrist: Float[np.ndarray, "7"]
+    wrist: Float[np.ndarray, " 7"]
     joints: Float[np.ndarray, " hand"]
 
 
@@ -145,9 +145,9 @@ class LiveState:
 
     count: int
     setup: Setup
-    links: Mapping[tuple[str, str], Float[np.ndarray, "7"]]
-    objects: Mapping[str, Float[np.ndarray, "7"]]
-    fixtures: Mapping[str, Float[np.ndarray, "7"]]
+    links: Mapping[tuple[str, str], Float[np.ndarray, " 7"]]
+    objects: Mapping[str, Float[np.ndarray, " 7"]]
+    fixtures: Mapping[str, Float[np.ndarray, " 7"]]
     scales: Mapping[str, float]
     goals: Mapping[str, Goal]
     forces: Forces

@@ -62,7 +62,7 @@ def drawn_box(
     return DrawnShape(Shape("box", (x, y, z), (1.0, 0.0, 0.0, 0.0), tuple(half)), colour)
 
 
-def draw(builder: Any, shapes: Iterable[DrawnShape], **finish: float) -> None:
+def draw(builder: Any, shapes: Iterable[DrawnShape], **finish: Any) -> None:
     """Adds shapes as visuals to a builder of an actor or link; needs a renderer.
 
     Args:

@@ -17,7 +17,7 @@ AMBIENT = 1.5
 
 
 def start_server(host: str, port: int, label: str) -> Any:
-    """Start viser's server on exactly this port, with z upwards and enough light.
+    """Start viser's server on exactly this port, with z upwards, enough light, and no button that shares the page.
 
     Raises:
         InputError: viser is not installed, the port is in use or none, or there is no such address.
@@ -36,6 +36,7 @@ def start_server(host: str, port: int, label: str) -> Any:
     if server.get_port() != port:
         server.stop()
         raise InputError(f"Port {port} is in use: choose another one with --port.")
+    server.gui.configure_theme(show_share_button=False)  # it would send the page through a server of others
     server.scene.set_up_direction("+z")
     server.scene.add_light_ambient("/ambient", intensity=AMBIENT)
     return server

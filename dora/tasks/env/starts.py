@@ -74,9 +74,7 @@ class ChosenStarts:
 
 def standing_starts(grid: Grid) -> ChosenStarts:
     """Place and yaw of an object that `standing` puts down."""
-    names = [
-        StartNumber(name, "m", c - w, c + w) for name, c, w in zip("xy", grid.centre, grid.spread, strict=True)
-    ]
+    names = [StartNumber(name, "m", c - w, c + w) for name, c, w in zip("xy", grid.centre, grid.spread, strict=True)]
     numbers = (*names, StartNumber("yaw", "rad", 0.0, 2 * pi))
 
     def shares(u: Tensor, pose: Pose) -> Tensor:
