@@ -242,7 +242,7 @@ def test_a_busy_port_is_refused(page: GraspPage):
 
 def test_without_viser(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(InputError, match=r"pip install 'dora\[view\]'"):
+    with pytest.raises(InputError, match=r"pip install 'viser>=1.1'"):
         start_server("127.0.0.1", 8080, "none")
 
 

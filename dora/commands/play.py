@@ -10,6 +10,7 @@ Needs no GPU and no graphics driver; only a film needs a Vulkan driver. Runs unt
 
 import contextlib
 import functools
+import logging
 import sys
 import time
 from collections.abc import Iterator
@@ -20,8 +21,7 @@ from typing import Annotated, Literal
 import torch
 import tyro
 
-from dora.agents.checkpoint import read_checkpoint
-from dora.agents.evaluation.play import checkpoint_path, load_policy, record
+from dora.agents.evaluation.play import record
 from dora.configs import check_ranges
 from dora.errors import InputError
 from dora.files import make_folder
@@ -29,6 +29,7 @@ from dora.live.page import Page
 from dora.live.players import Player, recorded, zero_correction
 from dora.live.recordings import Recording
 from dora.live.session import LARGEST_SEED, Session
+from dora.policies.policy import bundled_ids, load_policy
 from dora.sim.batch.rendering import can_render
 from dora.tasks import check_task_id, make_task
 
@@ -74,13 +75,12 @@ def find_policy(env_id: str, checkpoint: Path | None) -> Player | None:
     Raises:
         InputError: the checkpoint is missing, damaged, or of another task.
     """
-    if checkpoint is None:
+    if checkpoint is None and env_id not in bundled_ids():
         return None
-    path = checkpoint_path(checkpoint)
-    found = read_checkpoint(path)
-    if found.config.env != env_id:
-        raise InputError(f"{path} is a policy of {found.config.env}, not of {env_id}: name the task that it is of.")
-    return Player(POLICY, found.config.task_options, load_policy(found, path).greedy)
+    policy = load_policy(env_id if checkpoint is None else checkpoint)
+    if policy.env_id != env_id:
+        raise InputError(f"{checkpoint} is a policy of {policy.env_id}, not of {env_id}: name the task that it is of.")
+    return Player(POLICY, policy.env_kwargs, policy)
 
 
 def find_players(args: Args) -> list[Player]:
@@ -113,6 +113,7 @@ def film(args: Args, player: Player) -> Path:
     assert args.video is not None
     if player.recording is not None:
         raise InputError("--video films a policy: leave out --recording, or --video to watch it on the page.")
+    logging.getLogger("mani_skill").setLevel(logging.ERROR)  # the sentence below says what its note says
     if not can_render():
         raise InputError("No film: SAPIEN finds no Vulkan driver here (docs/rendering.md); the page needs none.")
     make_folder(args.video.parent)

@@ -19,7 +19,7 @@ UPDATES = 30.0
 """States that are sent in a second, if there are so many [Hz]."""
 WORDS, CURVES = 0.1, 0.25
 """Time between updates of words and widgets, and of plots [s]."""
-NEARER = 0.65
+NEARER = 0.75
 """Distance of the first view from its target, as a share of that of films [1]."""
 WIDTH = 340
 """Width of the panel with words and plots [pixels]."""

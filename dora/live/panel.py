@@ -17,6 +17,8 @@ STRONGEST, MIDDLE = 0.5, 0.1
 """Largest impulse of a push, and the one at the beginning [N s]."""
 SAME = 1e-6
 """Difference of a start's numbers, relative to their range, below which they are the same [1]."""
+DIGITS = 3
+"""Decimal places of a slider of the start [1]."""
 SLIDER_STEPS = 200
 """Steps of a slider of the start [1]."""
 SPEEDS = (0.1, 3.0, 0.1)
@@ -136,6 +138,6 @@ def _candidate_words(state: LiveState) -> str:
 
 
 def _value(state: LiveState, k: int) -> float:
-    """Number k of the present start, in its unit."""
+    """Number k of the present start, in its unit, as its slider shows it."""
     n = state.setup.numbers[k]
-    return float(n.low + min(max(state.episode.shares[k], 0.0), 1.0) * (n.high - n.low))
+    return min(max(round(n.low + state.episode.shares[k] * (n.high - n.low), DIGITS), n.low), n.high)

@@ -9,8 +9,8 @@ import numpy as np
 
 from dora.live.state import Episode, Setup
 
-HEIGHT = 180
-"""Height of a plot [pixels]."""
+OVERLAP_HEIGHT, TERMS_HEIGHT = 120, 180
+"""Heights of the plots [pixels]."""
 TERM_COLOURS = (
     "#1f77b4", "#ff7f0e", "#2ca02c", "#9467bd", "#8c564b", "#17becf", "#bcbd22", "#e377c2", "#7f7f7f", "#d62728",
 )  # fmt: skip
@@ -29,8 +29,10 @@ class Plots:
 
     def __init__(self, gui: Any, setup: Setup):
         self._setup = setup
-        self.overlap = _plot(gui, "overlap [mm] over time [s]", ("now", "largest so far", "limit"), OVERLAP_COLOURS)
-        self.terms = _plot(gui, "reward terms over time [s]", setup.terms, TERM_COLOURS)
+        self.overlap = _plot(
+            gui, "overlap [mm] over time [s]", OVERLAP_HEIGHT, ("now", "largest so far", "limit"), OVERLAP_COLOURS
+        )
+        self.terms = _plot(gui, "reward terms over time [s]", TERMS_HEIGHT, setup.terms, TERM_COLOURS)
 
     def update(self, episode: Episode) -> None:
         """Shows an episode so far."""
@@ -54,7 +56,7 @@ def _columns(*columns: np.ndarray) -> tuple[np.ndarray, ...]:
     return tuple(np.ascontiguousarray(column, np.float64) for column in columns)
 
 
-def _plot(gui: Any, title: str, names: Sequence[str], colours: Sequence[str]) -> Any:
+def _plot(gui: Any, title: str, height: int, names: Sequence[str], colours: Sequence[str]) -> Any:
     series = [{"label": "time [s]"}]
     series += [
         {"label": name, "stroke": colours[k % len(colours)], "width": 2, "points": {"show": False}}
@@ -62,5 +64,5 @@ def _plot(gui: Any, title: str, names: Sequence[str], colours: Sequence[str]) ->
     ]
     empty = _columns(np.array([0.0, 1.0]), *np.zeros((len(names), 2)))
     return gui.add_uplot(
-        empty, tuple(series), title=title, height=HEIGHT, scales={"x": {"time": False}}, legend={"show": True}
+        empty, tuple(series), title=title, height=height, scales={"x": {"time": False}}, legend={"show": True}
     )

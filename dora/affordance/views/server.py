@@ -31,7 +31,7 @@ def start_server(host: str, port: int, label: str) -> Any:
     try:
         viser = importlib.import_module("viser")
     except ImportError as error:
-        raise InputError("The page needs viser, which is not installed: pip install 'dora[view]'.") from error
+        raise InputError("The page needs viser, which is not installed: pip install 'viser>=1.1'.") from error
     server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     if server.get_port() != port:
         server.stop()
