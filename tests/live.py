@@ -1,5 +1,6 @@
 """A session whose time is the test's: each control step is due when the test says so."""
 
+import socket
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,6 +8,13 @@ from dora.live.orders import Order, Play, Randomise, Repeat, Reset, Run, Speed
 from dora.live.players import ZERO, Player, zero_correction
 from dora.live.session import REST, Session
 from dora.live.state import LiveState
+
+
+def free_port() -> int:
+    """A TCP port that nobody uses now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 class Clock:

@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from browser import find_browser, open_page, until
 from commands import call, load_command
-from live import Watched
+from live import Watched, free_port
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'viser>=1.1'")
 
@@ -31,12 +31,6 @@ from dora.live.status import status
 
 SETTLED = 0.3
 """Time after which the widgets' callbacks have been called [s]."""
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.fixture(scope="module")
@@ -140,9 +134,10 @@ def test_sliders_move_the_start_and_keep_each_other(watched: Watched, page: Page
     assert [slider.value for slider in sliders] == pytest.approx(
         [n.low + share * (n.high - n.low) for n, share in zip(numbers, before, strict=True)], abs=6e-4
     )
-    for k, share in ((0, 0.25), (2, 1.0)):
+    for count, (k, share) in enumerate(((0, 0.25), (2, 1.0)), 1):  # the second one before the first is answered
         sliders[k].value = numbers[k].low + share * (numbers[k].high - numbers[k].low)
-        answered(watched, page)
+        until(lambda count=count: watched.session._orders.qsize() == count)
+    answered(watched, page)
     assert watched.state.episode.shares == pytest.approx((0.25, before[1], 1.0, *before[3:]), abs=1e-6)
 
 
@@ -254,8 +249,9 @@ def test_the_command_serves_the_page_until_it_is_interrupted():
     words = [sys.executable, "-m", "dora", "play", "DoraCube-v1", "--zero-correction", "--port", str(port)]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
-        assert process.stdout is not None
-        address = until(lambda: next((line for line in process.stdout if line.startswith("http")), None))
+        lines = process.stdout
+        assert lines is not None
+        address = until(lambda: next((line for line in lines if line.startswith("http")), None))
         assert address.strip() == f"http://127.0.0.1:{port}"
         with socket.create_connection(("127.0.0.1", port)):
             pass

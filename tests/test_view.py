@@ -1,7 +1,6 @@
 """The page shows the grasps that pass its filters, in a browser if there is one here, else over its websocket."""
 
 import contextlib
-import socket
 import sys
 import time
 import urllib.request
@@ -17,6 +16,7 @@ import torch
 import trimesh
 from browser import PATIENCE, find_browser, open_page, until
 from commands import call, load_command
+from live import free_port
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
@@ -45,12 +45,6 @@ SMALL = 160
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 """First bytes of data compressed by zstd."""
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.fixture(scope="module")
