@@ -14,6 +14,7 @@ from dora.version import version_line
 
 COMMANDS = {
     "run": "train or evaluate a learner on a task",
+    "play": "watch a policy live on a web page, and disturb it",
     "grasps": "search for grasps of an object, judge them, and store them",
     "view": "show an object, its regions and its grasps on a web page",
     "bench": "measure how fast the parts of Dora are",
@@ -40,7 +41,8 @@ Affordance-guided dexterous manipulation on ManiSkill, with TorchRL agents.
   dora --version                     version and commit
   dora --completion {{{",".join(SHELLS)}}}    script that completes commands and options
 
-Example: dora run --env DoraHammer-v1
+Examples: dora play DoraHammer-v1
+          dora run --env DoraHammer-v1
 """
 
 

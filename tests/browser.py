@@ -66,6 +66,12 @@ class Page:
         """All visible text."""
         return self.evaluate("document.body ? document.body.innerText : ''") or ""
 
+    def press(self, label: str) -> None:
+        """Clicks the button with this label, once it is there."""
+        find = f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() === {json.dumps(label)})"
+        until(lambda: self.evaluate(f"!!{find}"))
+        self.evaluate(f"{find}.click()")
+
     def wait_for(self, words: str) -> str:
         """The text once it has these words."""
         return until(lambda: text if words in (text := self.text()) else None)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
+from live import free_port
 
 from dora.affordance.candidates import hand_digest
 from dora.affordance.objects.catalogue import load_object
@@ -111,3 +112,34 @@ except ValueError as error:
     done = subprocess.run([sys.executable, "-c", program], env=added[1], capture_output=True, text=True)
     assert done.stdout.startswith("InputError"), done.stderr[-2000:]
     assert words in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("toy", "shown"),
+    [
+        ("DoraBlock-v1", "['arm'] ['block'] ['x', 'y', 'yaw'] 4"),
+        ("DoraPair-v1", "['left', 'right'] ['jug', 'cube'] [] 0"),
+    ],
+)
+def test_it_can_be_watched_live_without_a_further_line(added: tuple[Path, dict[str, str]], toy: str, shown: str):
+    """With two arms neither starts nor candidates can be chosen."""
+    program = f"""
+import toy_plugin
+toy_plugin.pytest_sessionstart()
+from dora.live.page import Page
+from dora.live.players import zero_correction
+from dora.live.session import Session
+session = Session({toy!r}, [zero_correction({{}})], preset="none", clock=iter(range(1000)).__next__)
+page = Page(session, {free_port()})
+while session.state.episode.step < 5:
+    session.turn()
+page.update()
+state = session.state
+for arm, goal in state.goals.items():
+    assert abs(page.view._ghosts[arm].frame.position - goal.wrist[:3]).max() < 1e-6
+print(list(state.goals), list(state.objects), [n.name for n in state.setup.numbers], len(state.setup.candidates))
+page.stop()
+"""
+    done = subprocess.run([sys.executable, "-c", program], env=added[1], capture_output=True, text=True)
+    assert shown in done.stdout, done.stderr[-2000:]

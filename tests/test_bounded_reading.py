@@ -18,7 +18,8 @@ from dora.affordance.maps.packed_maps import COUNT, PART, POINT, unpack
 from dora.affordance.objects.folder_reading import read_object_folder
 from dora.affordance.objects.importing import read_mesh
 from dora.affordance.objects.labels import read_labels
-from dora.affordance.views.page import describe, start_server
+from dora.affordance.views.page import describe
+from dora.affordance.views.server import start_server
 from dora.agents.runs.report import write_report
 from dora.agents.runs.run_folder import RunFolder
 from dora.files import read_tensors

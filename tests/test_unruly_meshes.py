@@ -20,7 +20,7 @@ from dora.affordance.objects.folder_writing import write_object_folder
 from dora.affordance.objects.importing import import_mesh, read_mesh
 from dora.affordance.objects.labels import FaceLabels, grasp_classes, read_labels, without_number
 from dora.affordance.objects.surface_repair import Repaired, repair
-from dora.affordance.views.page import legend_html
+from dora.affordance.views.server import legend_html
 from dora.errors import InputError
 from dora.progress import ProgressDisplay
 from dora.tables import markdown_text, show_any_script

@@ -1,7 +1,6 @@
 """The page shows the grasps that pass its filters, in a browser if there is one here, else over its websocket."""
 
 import contextlib
-import socket
 import sys
 import time
 import urllib.request
@@ -17,13 +16,15 @@ import torch
 import trimesh
 from browser import PATIENCE, find_browser, open_page, until
 from commands import call, load_command
+from live import free_port
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from dora.affordance.bundled_sets import bundled_path
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.hand.hand_mesh import HandMesh, joined
+from dora.affordance.hand.hand_mesh import HandMesh
 from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.hand.link_meshes import joined
 from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.palette import PALETTE
 from dora.affordance.views import album, pictures
@@ -32,6 +33,7 @@ from dora.affordance.views.album import chosen
 from dora.affordance.views.page import CONTACTS, VALID, Filter, GraspPage, describe
 from dora.affordance.views.pictures import PARTS, TILE, best_view
 from dora.affordance.views.rasteriser import Camera, seen
+from dora.affordance.views.server import start_server
 from dora.affordance.views.surface import EDGE, Surface
 from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion
@@ -43,12 +45,6 @@ SMALL = 160
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 """First bytes of data compressed by zstd."""
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.fixture(scope="module")
@@ -235,13 +231,13 @@ def test_messages_are_unpacked_with_every_part_that_is_compressed():
 def test_a_busy_port_is_refused(page: GraspPage):
     port = page.server.get_port()
     with pytest.raises(InputError, match=f"Port {port} is in use"):
-        viewing.start_server("127.0.0.1", port, "second")
+        start_server("127.0.0.1", port, "second")
 
 
 def test_without_viser(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(InputError, match=r"pip install 'dora\[view\]'"):
-        viewing.start_server("127.0.0.1", 8080, "none")
+    with pytest.raises(InputError, match=r"pip install 'viser>=1.1'"):
+        start_server("127.0.0.1", 8080, "none")
 
 
 @pytest.fixture(scope="module")

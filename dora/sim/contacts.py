@@ -25,10 +25,13 @@ class Contacts:
         separation: (n, g, g) smallest separation over the contact points of two groups [m]; negative values are
             penetration depths, +inf means that PhysX reports no contact. Symmetric. NaN on a GPU, which does not
             report it.
+        point: (n, g, g, 3) mean of the contact points of two groups, weighted by their impulses, in the world frame
+            [m]; only if the monitor keeps points, and 0 where there are none. Symmetric.
     """
 
     impulse: Float[Tensor, "n g g 3"]
     separation: Float[Tensor, "n g g"]
+    point: Float[Tensor, "n g g 3"] | None = None
 
 
 class ContactMonitor:
@@ -84,6 +87,13 @@ class ContactMonitor:
         """Contacts of the last physics step."""
         scanner = self._scanned()
         return scanner.result() if scanner else self._read_gpu()
+
+    def keep_points(self) -> None:
+        """From now on `Contacts.point` says where groups touch. Not on a GPU."""
+        for scanner in (self._scanner, self._collector):
+            if scanner is not None:
+                scanner.keeps_points = True
+                scanner.clear()
 
     def _scanned(self) -> "_GroupScanner | None":
         """The scanner after it has scanned the contacts of the last physics step; None on a GPU."""
@@ -180,6 +190,7 @@ class _GroupScanner(ContactScanner):
         super().__init__(readers)
         self._wanted, self._places = wanted, places
         self._count = len(groups)
+        self.keeps_points = False
         self._group_of: dict[int, int] = {}
         members = [member for group in groups.values() for member in group]
         self._kept_alive = [body for member in members for body in member._bodies]  # ids stay unique
@@ -194,6 +205,7 @@ class _GroupScanner(ContactScanner):
         self._slots: list[int] = []
         self._impulses: list[np.ndarray] = []
         self._separations: list[float] = []
+        self._places_of_all: list[np.ndarray] = []
         self._point_slots: list[tuple[int, int]] = []
         self._point_impulses: list[np.ndarray] = []
         self._positions: list[np.ndarray] = []
@@ -202,7 +214,8 @@ class _GroupScanner(ContactScanner):
         """Drop the collected points of one environment."""
         pairs = self._count**2
         kept = [k for k, slot in enumerate(self._slots) if slot // pairs != environment]
-        _keep(kept, self._slots, self._impulses, self._separations)
+        all_places = [self._places_of_all] if self.keeps_points else []
+        _keep(kept, self._slots, self._impulses, self._separations, *all_places)
         kept = [k for k, (owner, _) in enumerate(self._point_slots) if owner != environment]
         _keep(kept, self._point_slots, self._point_impulses, self._positions)
 
@@ -225,6 +238,8 @@ class _GroupScanner(ContactScanner):
                 self._slots.append(slot)
                 self._impulses.append(point.impulse)
                 self._separations.append(point.separation)
+            if self.keeps_points:
+                self._places_of_all += [point.position for point in contact.points]
             if (place := self._places[pair]) >= 0:
                 for point in contact.points:
                     self._point_slots.append((environment, place))
@@ -257,7 +272,19 @@ class _GroupScanner(ContactScanner):
             np.minimum.at(separation.reshape(-1), self._slots, self._separations)
         impulse = impulse - impulse.swapaxes(1, 2)
         separation = np.minimum(separation, separation.swapaxes(1, 2))
-        return Contacts(torch.from_numpy(impulse), torch.from_numpy(separation))
+        return Contacts(torch.from_numpy(impulse), torch.from_numpy(separation), self._middles(shape))
+
+    def _middles(self, shape: tuple[int, int, int]) -> Tensor | None:
+        """Means (n, g, g, 3) of the points of each pair, weighted by impulses; None if points are not kept."""
+        if not self.keeps_points:
+            return None
+        total, weight = np.zeros((*shape, 3)), np.zeros(shape)
+        if self._slots:
+            size = np.linalg.norm(np.array(self._impulses), axis=-1)
+            np.add.at(weight.reshape(-1), self._slots, size)
+            np.add.at(total.reshape(-1, 3), self._slots, size[:, None] * np.array(self._places_of_all))
+        total, weight = total + total.swapaxes(1, 2), (weight + weight.swapaxes(1, 2))[..., None]
+        return torch.from_numpy(np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)).float()
 
 
 def _keep(kept: Sequence[int], *lists: list[Any]) -> None:

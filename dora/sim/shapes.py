@@ -1,6 +1,8 @@
-"""PhysX collision shapes of robot descriptions and objects, made in memory without mesh files."""
+"""Shapes made in memory without mesh files: PhysX collision shapes, and shapes of furniture that are only drawn."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import sapien
@@ -37,3 +39,39 @@ def collision_shape(
     made = _PRIMITIVES[shape.kind]([scale * length for length in shape.size], material)
     made.local_pose = sapien.Pose([scale * x for x in shape.position], shape.quaternion)
     return made
+
+
+@dataclass(frozen=True)
+class DrawnShape:
+    """A shape that is only drawn, in the frame of its body.
+
+    Attributes:
+        shape: a box, sphere, cylinder or capsule.
+        colour: red, green, blue and opacity, 0 to 1.
+    """
+
+    shape: Shape
+    colour: tuple[float, float, float, float]
+
+
+def drawn_box(
+    position: Iterable[float], half: Iterable[float], colour: tuple[float, float, float, float]
+) -> DrawnShape:
+    """A box along the axes of its body, with its centre and half sides [m]."""
+    x, y, z = position
+    return DrawnShape(Shape("box", (x, y, z), (1.0, 0.0, 0.0, 0.0), tuple(half)), colour)
+
+
+def draw(builder: Any, shapes: Iterable[DrawnShape], **finish: Any) -> None:
+    """Adds shapes as visuals to a builder of an actor or link; needs a renderer.
+
+    Args:
+        builder: of SAPIEN or ManiSkill.
+        shapes: boxes, cylinders, capsules and spheres.
+        finish: further properties of the material, such as roughness.
+    """
+    for drawn in shapes:
+        pose = sapien.Pose(drawn.shape.position, drawn.shape.quaternion)
+        material = sapien.render.RenderMaterial(base_color=list(drawn.colour), **finish)
+        size = [list(drawn.shape.size)] if drawn.shape.kind == "box" else drawn.shape.size
+        getattr(builder, f"add_{drawn.shape.kind}_visual")(pose, *size, material)

@@ -151,7 +151,8 @@ class JugTask(Task):
 
     def make_mdp(self, scene: TaskScene) -> Mdp[Snapshot]:
         c: JugConfig = self.config
-        return Mdp(stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS, partial(failed, c=c))
+        judged = stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS, partial(failed, c=c)
+        return Mdp(*judged, "the jug has tipped over, has left the table, or stands on it again after it was lifted")
 
     def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
         return best_candidates("jug", CLASS, self.config.fewest_lifts, self.config.most_candidates, region)

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
 
-from dora.affordance.hand.hand_mesh import face_colours
+from dora.affordance.hand.link_meshes import face_colours
 
 OVERSAMPLING = 2
 """Pixels rendered along each side of a pixel shown, for antialiasing."""

@@ -9,7 +9,7 @@ from jaxtyping import Int, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dora.affordance.hand.hand_mesh import GAMMA
+from dora.affordance.hand.link_meshes import GAMMA
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.palette import PALETTE, colours
 from dora.affordance.search.cache import map_of

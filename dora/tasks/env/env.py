@@ -76,6 +76,8 @@ class DoraEnv(BaseEnv):
     """The task that it has, an instance of `TASK`."""
     narrow: Callable[[Tensor], Tensor] | None = None
     """Takes the (b, c) candidates that b new episodes may use and returns fewer; to try candidates one by one."""
+    chosen_start: Callable[[Tensor], Tensor] | None = None
+    """Takes the random numbers (b, DRAWS) of b new starts and returns those that are used; to choose a start."""
     resetting = False
     """Whether a reset is under way."""
     _snapshot: Snapshot | None = None
@@ -106,8 +108,7 @@ class DoraEnv(BaseEnv):
         check_grasps(grasps, tuple(self.TASK.ARMS))
         self.parts, self.config, self._grasps = options.parts, options.config, grasps
         self.task, several = self.TASK(self.config), len(options.robots) > 1
-        self._shares: dict[str, float] = {}
-        self._tables: dict[str, ReachTable] = {}
+        self._shares, self._tables = dict[str, float](), dict[str, ReachTable]()
         self._forced_scale: Tensor | None = None
         super().__init__(
             *args,

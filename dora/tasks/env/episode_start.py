@@ -66,7 +66,7 @@ def begin_episodes(env: Any, rows: Int[Tensor, " b"]) -> None:
     for arm in env.arms.values():
         arm.agent.robot.set_qpos(arm.home_joints().expand(len(rows), -1))
         arm.rest(rows)
-    env.task.place(env.task_scene, rows, place)
+    env.task.place(env.task_scene, rows, place if env.chosen_start is None else env.chosen_start(place))
     env.memory.begin(rows, {name: body.pose.p[rows] for name, body in env.objects.items()})
     randomisation = env.config.randomisation
     low, high = randomisation.friction

@@ -1,6 +1,7 @@
-"""Where objects start: standing on the table within a grid of places, at any yaw, where a candidate can be reached."""
+"""Where objects start: standing on the table within a grid of places, and starts that a person chooses."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import pi
 
 import torch
@@ -39,3 +40,46 @@ def standing(u: Float[Tensor, "b d"], height: Float[Tensor, " b"], grid: Grid, r
     able = reachable(position.flatten(0, 1), quaternion.flatten(0, 1)).any(-1).reshape(len(u), TRIES)
     chosen = torch.arange(len(u), device=u.device), able.float().argmax(-1)
     return position[chosen], quaternion[chosen]
+
+
+@dataclass(frozen=True)
+class StartNumber:
+    """A number of a start that a person can choose.
+
+    Attributes:
+        name, unit: what it is.
+        low, high: its range, in `unit`.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class ChosenStarts:
+    """How the numbers that a person chooses become the random numbers of a start, and the other way round.
+
+    Attributes:
+        numbers: k of them; each is given as its share of the way from the lowest to the highest value, 0 to 1.
+        draws: shares (k,) -> the random numbers (d,) of a start as `Task.place` takes them.
+        shares: random numbers (d,) of a start, and the pose of the object then (position [m], quaternion) -> (k,).
+    """
+
+    numbers: tuple[StartNumber, ...]
+    draws: Callable[[Float[Tensor, " k"]], Float[Tensor, " d"]]
+    shares: Callable[[Float[Tensor, " d"], Pose], Float[Tensor, " k"]]
+
+
+def standing_starts(grid: Grid) -> ChosenStarts:
+    """Place and yaw of an object that `standing` puts down."""
+    names = [StartNumber(name, "m", c - w, c + w) for name, c, w in zip("xy", grid.centre, grid.spread, strict=True)]
+    numbers = (*names, StartNumber("yaw", "rad", 0.0, 2 * pi))
+
+    def shares(u: Tensor, pose: Pose) -> Tensor:
+        place = [(float(x) - n.low) / (n.high - n.low) for x, n in zip(pose[0], names, strict=False)]
+        yaw = 2 * torch.atan2(pose[1][3], pose[1][0])
+        return torch.tensor([*place, float(yaw / (2 * pi) % 1)]).clamp(0, 1)
+
+    return ChosenStarts(numbers, lambda chosen: chosen.repeat(TRIES), shares)

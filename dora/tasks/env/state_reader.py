@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dora.geometry.rotations import quaternion_apply, quaternion_inverse
 from dora.sim.bodies import BodyReader
-from dora.sim.contacts import ContactMonitor
+from dora.sim.contacts import ContactMonitor, Contacts
 from dora.sim.overlap import OverlapMonitor
 from dora.sim.robot_agent import DescribedRobot
 from dora.tasks.guidance.guide import Guide
@@ -36,6 +36,8 @@ class StateReader:
 
     Attributes:
         overlap: of robots and objects with each other and with the world, in every physics step.
+        pairs: names of the two groups of every pair whose contacts are read.
+        contacts: those of the last control step, and None before; `contact_names` are its groups.
     """
 
     def __init__(
@@ -64,6 +66,8 @@ class StateReader:
         located = [(part, handles[arm]) for arm in agents for part in parts[arm]] if points else []
         groups |= {name: [body] for name, body in objects.items()} | {WORLD: list(world)}
         self._contacts = ContactMonitor(scene, groups, pairs, located, every_step)
+        self.pairs, self.contact_names = tuple(pairs), self._contacts.names
+        self.contacts: Contacts | None = None
         links = [link for agent in agents.values() for link in agent.robot.links]
         self.overlap = OverlapMonitor(scene, [*links, *objects.values()])
         self.points = points * len(agents)
@@ -73,6 +77,10 @@ class StateReader:
         known = [CONTACT_CLASSES.index(name) if name in CONTACT_CLASSES else 0 for name in classes]
         self._classes = torch.tensor([0, *known], device=scene.device)  # the first for an empty row
 
+    def keep_points(self) -> None:
+        """From now on `contacts` says where groups touch, for those who draw it."""
+        self._contacts.keep_points()
+
     def record(self, memory: EpisodeMemory, frequency: float) -> None:
         """Writes contacts and overlap of the last control step into the memory.
 
@@ -80,7 +88,8 @@ class StateReader:
             memory: of the episode.
             frequency: 1 / the time over which impulses were collected [Hz]: a physics step, or all of a control step.
         """
-        contacts, count = self._contacts.take(), self._part_count
+        self.contacts = contacts = self._contacts.take()
+        count = self._part_count
         memory.record_penetration(self.overlap.take())
         for arm, rows in self._rows.items():
             column = count + self._names.index(self._handles[arm])

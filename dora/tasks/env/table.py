@@ -4,6 +4,8 @@ import sapien
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Pose
 
+from dora.sim.shapes import DrawnShape, draw, drawn_box
+
 TABLE_CENTRE = (0.35, 0.0)
 """Centre of the table top in the robot's base frame [m]."""
 TABLE_HALF = (0.65, 0.6, 0.02)
@@ -20,31 +22,46 @@ ROOM_HALF = 3.0
 """Half width of the room that is only drawn [m]."""
 
 
+def table_shapes() -> tuple[DrawnShape, ...]:
+    """The table top and its legs, in the frame in which the upper face is z = 0."""
+    (x, y), half = TABLE_CENTRE, TABLE_HEIGHT / 2 - TABLE_HALF[2]
+    legs = [
+        drawn_box(
+            (
+                x + sx * (TABLE_HALF[0] - 2 * LEG_HALF),
+                y + sy * (TABLE_HALF[1] - 2 * LEG_HALF),
+                -2 * TABLE_HALF[2] - half,
+            ),
+            (LEG_HALF, LEG_HALF, half),
+            STEEL,
+        )
+        for sx in (-1, 1)
+        for sy in (-1, 1)
+    ]
+    return (drawn_box((x, y, -TABLE_HALF[2]), TABLE_HALF, WOOD), *legs)
+
+
+def room_shapes() -> tuple[DrawnShape, ...]:
+    """Floor and walls around the table."""
+    x, y = TABLE_CENTRE
+    floor = drawn_box((x, y, -TABLE_HEIGHT - 0.01), (ROOM_HALF, ROOM_HALF, 0.01), FLOOR)
+    walls = [
+        drawn_box(
+            (x + sx * ROOM_HALF, y + sy * ROOM_HALF, ROOM_HALF - TABLE_HEIGHT),
+            (0.01 if sx else ROOM_HALF, 0.01 if sy else ROOM_HALF, ROOM_HALF),
+            WALL,
+        )
+        for sx, sy in ((1, 0), (-1, 0), (0, 1), (0, -1))
+    ]
+    return (floor, *walls)
+
+
 def add_table(scene: ManiSkillScene) -> Actor:
     """A static table whose upper face is z = 0, with legs and a room that are only drawn."""
     x, y = TABLE_CENTRE
-    top = sapien.Pose([x, y, -TABLE_HALF[2]])
     builder = scene.create_actor_builder()
-    builder.add_box_collision(top, TABLE_HALF)
+    builder.add_box_collision(sapien.Pose([x, y, -TABLE_HALF[2]]), TABLE_HALF)
     if scene.can_render():
-        wood, steel, floor, wall = (
-            sapien.render.RenderMaterial(base_color=list(c), roughness=0.7, specular=0.3)
-            for c in (WOOD, STEEL, FLOOR, WALL)
-        )
-        builder.add_box_visual(top, TABLE_HALF, wood)
-        half = TABLE_HEIGHT / 2 - TABLE_HALF[2]
-        for sx in (-1, 1):
-            for sy in (-1, 1):
-                foot = [
-                    x + sx * (TABLE_HALF[0] - 2 * LEG_HALF),
-                    y + sy * (TABLE_HALF[1] - 2 * LEG_HALF),
-                    -2 * TABLE_HALF[2] - half,
-                ]
-                builder.add_box_visual(sapien.Pose(foot), (LEG_HALF, LEG_HALF, half), steel)
-        builder.add_box_visual(sapien.Pose([x, y, -TABLE_HEIGHT - 0.01]), (ROOM_HALF, ROOM_HALF, 0.01), floor)
-        for sx, sy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            centre = [x + sx * ROOM_HALF, y + sy * ROOM_HALF, ROOM_HALF - TABLE_HEIGHT]
-            half = (0.01 if sx else ROOM_HALF, 0.01 if sy else ROOM_HALF, ROOM_HALF)
-            builder.add_box_visual(sapien.Pose(centre), half, wall)
+        draw(builder, (*table_shapes(), *room_shapes()), roughness=0.7, specular=0.3)
     builder.initial_pose = Pose.create(sapien.Pose())
     return builder.build_static("table")

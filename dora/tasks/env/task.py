@@ -14,7 +14,10 @@ from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.reach.feasibility_table import Grid
 from dora.robot import RobotDescription
+from dora.sim.shapes import DrawnShape
 from dora.tasks.env.arm import Arm, ArmSpec
+from dora.tasks.env.starts import STANDING_DRAWS, ChosenStarts, standing_starts
+from dora.tasks.env.table import table_shapes
 from dora.tasks.guidance.grasp_and_lift import GraspReference
 from dora.tasks.guidance.reference import Reference
 from dora.tasks.mdp.config import TaskConfig
@@ -103,6 +106,16 @@ class Task(ABC):
     def start_grid(self, arm: str) -> Grid | None:
         """Where the object of an arm may stand at the start, for the table of f_reach; None where it does not stand."""
         return None
+
+    def starts(self) -> ChosenStarts | None:
+        """Numbers of a start that a person can choose; place and yaw of an object that stands, None elsewhere."""
+        grids = [self.start_grid(arm) for arm in self.ARMS]
+        alone = len(grids) == 1 and self.DRAWS == STANDING_DRAWS
+        return standing_starts(grids[0]) if alone and grids[0] is not None else None
+
+    def drawn(self, scene: "TaskScene") -> Mapping[str, tuple[Actor | Link, tuple[DrawnShape, ...]]]:
+        """What a page draws besides robots and objects: bodies by name, with their shapes."""
+        return {"table": (scene.table, table_shapes())}
 
     def masses(self, name: str, nominal: Float[Tensor, " b"], u: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
         """Masses of new episodes [kg] from an object's nominal ones and uniform random numbers."""

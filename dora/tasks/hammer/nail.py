@@ -23,6 +23,8 @@ from mani_skill.utils.structs import Actor, Articulation, Link
 from sapien.physx import PhysxMaterial
 from torch import Tensor
 
+from dora.robot.shapes import Shape
+from dora.sim.shapes import DrawnShape, draw, drawn_box
 from dora.sim.substeps import watch_contacts
 
 HEAD_RADIUS, HEAD_HALF = 0.008, 0.002
@@ -219,6 +221,15 @@ class Nail:
         self._look(index.tolist())
 
 
+def drawn_links(settings: NailSettings) -> tuple[tuple[DrawnShape, ...], tuple[DrawnShape, ...]]:
+    """What post and nail look like, each in its own frame."""
+    height = settings.top[2] - settings.stand
+    post = drawn_box((0.0, 0.0, -settings.stand - height / 2), (POST_HALF, POST_HALF, height / 2), PINE)
+    head = Shape("cylinder", (0.0, 0.0, -HEAD_HALF), DOWN, (HEAD_RADIUS, HEAD_HALF))
+    shank = Shape("cylinder", (0.0, 0.0, -settings.stand / 2), DOWN, (SHANK_RADIUS, settings.stand / 2))
+    return (post,), (DrawnShape(head, IRON), DrawnShape(shank, IRON))
+
+
 def _build(scene: ManiSkillScene, settings: NailSettings) -> Articulation:
     """Post and nail as an articulation; its root is where the top of the undriven nail is."""
     builder = scene.create_articulation_builder()
@@ -233,15 +244,12 @@ def _build(scene: ManiSkillScene, settings: NailSettings) -> Articulation:
     axis = sapien.Pose(q=DOWN)
     nail.set_joint_name("nail")
     nail.set_joint_properties("prismatic", [[0.0, settings.travel]], axis, axis)
-    head = sapien.Pose([0, 0, -HEAD_HALF], DOWN)
     density = settings.mass / (np.pi * HEAD_RADIUS**2 * 2 * STOP_HALF)
     stop = sapien.Pose([0, 0, -STOP_HALF], DOWN)
     nail.add_cylinder_collision(stop, HEAD_RADIUS, STOP_HALF, material, density=density)
     if scene.can_render():
-        pine, iron = (sapien.render.RenderMaterial(base_color=list(c), roughness=0.6) for c in (PINE, IRON))
-        post.add_box_visual(centre, half, pine)
-        nail.add_cylinder_visual(head, HEAD_RADIUS, HEAD_HALF, iron)
-        nail.add_cylinder_visual(sapien.Pose([0, 0, -settings.stand / 2], DOWN), SHANK_RADIUS, settings.stand / 2, iron)
+        for link, shapes in zip((post, nail), drawn_links(settings), strict=True):
+            draw(link, shapes, roughness=0.6)
     builder.initial_pose = sapien.Pose(list(settings.top))
     articulation = builder.build("nail", fix_root_link=True)
     for link in articulation.links:

@@ -19,14 +19,16 @@ from dora.affordance.objects.catalogue import load_object
 from dora.geometry.poses import relative
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
 from dora.robot import RobotDescription
+from dora.sim.shapes import DrawnShape
 from dora.tasks.env.arm import Arm, ArmSpec, start_posture
 from dora.tasks.env.registration import register_task
 from dora.tasks.env.scene import TaskScene
+from dora.tasks.env.starts import ChosenStarts, StartNumber
 from dora.tasks.env.task import Task
 from dora.tasks.guidance.reference import Reference
 from dora.tasks.hammer.ballistics import Strike
 from dora.tasks.hammer.mdp import failed, paper_terms, stages, terms
-from dora.tasks.hammer.nail import Nail, NailSettings
+from dora.tasks.hammer.nail import Nail, NailSettings, drawn_links
 from dora.tasks.hammer.reach import with_waiting_hand, within_reach
 from dora.tasks.hammer.reference import CatchReference, CatchSettings
 from dora.tasks.hammer.snapshot import (
@@ -181,7 +183,8 @@ class HammerTask(Task):
 
     def make_mdp(self, scene: TaskScene) -> Mdp[HammerSnapshot]:
         c: HammerConfig = self.config
-        return Mdp(stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS, partial(failed, c=c))
+        judged = stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS, partial(failed, c=c)
+        return Mdp(*judged, "the hammer has fallen")
 
     def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
         return best_candidates("hammer", CLASS, self.config.fewest_catches, self.config.most_candidates, region)
@@ -246,6 +249,21 @@ class HammerTask(Task):
         scene.object.set_angular_velocity(c.spin * u[:, 6:9])
         self.nail.begin(rows)
         self.history.write(rows, history=UNKNOWN)
+
+    def starts(self) -> ChosenStarts:
+        """Place, height, tilt, roll and spin of the hammer when it is released: the random numbers themselves."""
+        c: HammerConfig = self.config
+        middles = zip("xy", c.release[:2], strict=True)
+        place = [StartNumber(f"release {n}", "m", x - c.spread, x + c.spread) for n, x in middles]
+        turns = [StartNumber(n, "rad", -w, w) for n, w in (("tilt x", c.tilt), ("tilt y", c.tilt), ("roll", c.roll))]
+        spins = [StartNumber(f"spin {n}", "rad/s", -c.spin, c.spin) for n in "xyz"]
+        numbers = (*place, StartNumber("fall", "m", *c.fall), *turns, *spins)
+        return ChosenStarts(numbers, lambda shares: shares, lambda u, pose: u)
+
+    def drawn(self, scene: TaskScene) -> Mapping[str, tuple[Actor | Link, tuple[DrawnShape, ...]]]:
+        """The table, the post and the nail."""
+        links = zip(("post", "nail"), self.nail.links, drawn_links(self.config.nail), strict=True)
+        return {**super().drawn(scene), **{name: (link, shapes) for name, link, shapes in links}}
 
     # ------------------------------------------------------------------ reading
 

@@ -40,6 +40,7 @@ class Mdp(Generic[S]):
         penetration_limit: largest overlap in an episode that counts as a success [m].
         observations: entries beyond those of every task.
         failed: snapshot, memory -> (n,) bool: nothing can mend the episode.
+        failure: what has happened then, in words.
     """
 
     stages: Sequence[Stage[Any]]
@@ -48,6 +49,7 @@ class Mdp(Generic[S]):
     penetration_limit: float
     observations: Mapping[str, Entry] = field(default_factory=dict)
     failed: Callable[[Any, EpisodeMemory], Bool[Tensor, " n"]] = left_table
+    failure: str = "an object has left the table or the reach of the arm"
 
     def verdict(
         self, finished: Bool[Tensor, " n"], unreachable: Bool[Tensor, " n"], s: S, memory: EpisodeMemory

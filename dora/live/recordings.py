@@ -1,0 +1,127 @@
+"""Trajectory files of ManiSkill: actions and first states of recorded episodes, with what their task was made with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from jaxtyping import Float
+
+from dora.errors import InputError, shown
+from dora.reading import check_size, read_json
+from dora.tasks import check_task_id
+
+MOST_BYTES = 4_000_000_000
+"""Size of a trajectory file above which it is not read [bytes]."""
+MOST_NUMBERS = 50_000_000
+"""Largest number of values of the actions, or of the states, of one episode."""
+MOST_SEED = 2**32 - 1
+"""Largest seed."""
+KEPT = ("guidance", "guidance_parts", "hand_joints", "preset", "config", "control_mode", "robot_uids")
+"""Arguments of a task that say what its actions and states mean; the others are of the machine that recorded."""
+PREFIX = "dora:"
+"""What our ids begin with in a recording."""
+
+
+@dataclass(frozen=True)
+class RecordedEpisode:
+    """One episode of a file.
+
+    Attributes:
+        seed: of its start; 0 if the file does not say.
+        actions: (t, a).
+        state: the first state, as of `get_state_dict`, of one environment; None if the file has no states.
+    """
+
+    seed: int
+    actions: Float[np.ndarray, "t a"]
+    state: Mapping[str, Any] | None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A trajectory file (HDF5) with its index (JSON) beside it; episodes are read when they are played.
+
+    Attributes:
+        path: of the trajectory file.
+        env_id: id of the task.
+        options: arguments of the task.
+        names: of the episodes' groups in the file, and their seeds.
+    """
+
+    path: Path
+    env_id: str
+    options: Mapping[str, Any]
+    names: tuple[tuple[str, int], ...]
+
+    @classmethod
+    def open(cls, path: Path) -> Recording:
+        """Reads the index.
+
+        Raises:
+            InputError: a file is missing or something else, or the recording is of no Dora task.
+        """
+        check_size(path, "trajectory file", MOST_BYTES)
+        index_path = path.with_suffix(".json")
+        if not index_path.is_file():
+            raise InputError(f"{index_path} is missing: the index of a recording has to lie beside {path.name}.")
+        index = read_json(index_path, "index of a recording")
+        info = index.get("env_info") if isinstance(index, dict) else None
+        episodes = index.get("episodes") if isinstance(index, dict) else None
+        if not isinstance(info, dict) or not isinstance(episodes, list) or not isinstance(info.get("env_id"), str):
+            raise InputError(f"{index_path} is no index of a ManiSkill recording: name the .h5 file of one.")
+        env_id = info["env_id"].removeprefix(PREFIX)
+        check_task_id(env_id)
+        kwargs: Any = info.get("env_kwargs")
+        kwargs = kwargs if isinstance(kwargs, dict) else {}
+        names = tuple(_named(episode, index_path) for episode in episodes)
+        if not names:
+            raise InputError(f"{path} has no episode: record one that succeeds.")
+        return cls(path, env_id, {name: kwargs[name] for name in KEPT if name in kwargs}, names)
+
+    def episode(self, number: int) -> RecordedEpisode:
+        """Reads one episode, by its place in the file.
+
+        Raises:
+            InputError: it is missing or damaged.
+        """
+        name, seed = self.names[number]
+        try:
+            with h5py.File(self.path) as file:
+                group: Any = file[name]
+                actions = np.asarray(_bounded(group["actions"]), np.float32)
+                state = _first(group["env_states"]) if "env_states" in group else None
+        except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise InputError(f"{self.path} has no intact episode {name} ({reason}): record it again.") from error
+        if actions.ndim != 2 or not len(actions) or not np.isfinite(actions).all():
+            raise InputError(f"{self.path}: the actions of {name} are no table of finite numbers: record it again.")
+        return RecordedEpisode(seed, actions, state)
+
+
+def _named(episode: Any, path: Path) -> tuple[str, int]:
+    """Name of an episode's group and its seed."""
+    number = episode.get("episode_id") if isinstance(episode, dict) else None
+    seed = episode.get("episode_seed", 0) if isinstance(episode, dict) else 0
+    seed = seed[0] if isinstance(seed, list) and seed else seed
+    if type(number) is not int or number < 0:
+        raise InputError(f"{path} has an episode with the number {shown(number)}: record it again.")
+    return f"traj_{number}", seed if type(seed) is int and 0 <= seed <= MOST_SEED else 0
+
+
+def _bounded(data: Any) -> Any:
+    if not isinstance(data, h5py.Dataset) or data.size is None or data.size > MOST_NUMBERS:
+        raise ValueError("too many numbers, or none")
+    return data
+
+
+def _first(group: Any) -> dict[str, Any]:
+    """The first row of every array of a group, as (1, ...)."""
+    return {
+        name: _first(part) if isinstance(part, h5py.Group) else np.asarray(_bounded(part)[:1], np.float32)
+        for name, part in group.items()
+    }

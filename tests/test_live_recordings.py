@@ -1,0 +1,108 @@
+"""Recorded episodes are played as they were recorded, and files that are none are refused in one sentence."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from live import Watched
+
+from dora.errors import InputError
+from dora.live.orders import Choose, Play, Randomise, Start
+from dora.live.players import ZERO, recorded, zero_correction
+from dora.live.recordings import Recording
+from dora.tools.demonstrations import record_demonstrations
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = record_demonstrations("DoraCube-v1", tmp_path_factory.mktemp("recorded"), tries=2, num_envs=2, seed=5)
+    assert made.recorded > 0
+    return made.path
+
+
+def test_a_demonstration_of_a_batch_succeeds_again_alone(recording: Path):
+    opened = Recording.open(recording)
+    assert (opened.env_id, opened.options["guidance"]) == ("DoraCube-v1", "none")
+    watched = Watched("DoraCube-v1", [recorded(opened), zero_correction({})])
+    episode = opened.episode(0)
+    with h5py.File(recording) as file:
+        group: Any = file["traj_0"]
+        poses = np.array(group["env_states"]["actors"]["cube"])[:, :7]
+    assert watched.state.player == "recording demonstrations.h5"
+    np.testing.assert_allclose(watched.state.objects["cube"], poses[0], atol=1e-5)
+    assert watched.do(Start((0.5, 0.5, 0.5))).message.startswith("A recording has its own start")
+    assert watched.do(Choose(0)).message.startswith("A recording has its own candidate")
+    assert watched.do(Randomise("none")).message.startswith("A recording has its own randomisation")
+    state = watched.to_the_end()
+    assert (state.episode.step, state.episode.success) == (len(episode.actions), True)
+    np.testing.assert_allclose(state.objects["cube"][:3], poses[-1, :3], atol=0.01)
+    state = watched.do(Play(ZERO))
+    assert "candidate" in state.setup.terms  # guided again: another environment
+    assert watched.do(Play("recording demonstrations.h5")).episode.step == 0
+    watched.session.stop()
+
+
+def damaged(path: Path, folder: Path, how: str) -> Path:
+    """A copy of a recording with something wrong."""
+    copy = folder / "copy.h5"
+    shutil.copy(path, copy)
+    index = json.loads(path.with_suffix(".json").read_text())
+    if how == "stock":
+        index["env_info"]["env_id"] = "PickCube-v1"
+    elif how == "empty":
+        index["episodes"] = []
+    elif how == "list":
+        index = [1, 2]
+    elif how == "number":
+        index["episodes"][0]["episode_id"] = "../x"
+    if how != "no index":
+        copy.with_suffix(".json").write_text(json.dumps(index) if how != "no json" else "{")
+    if how == "text":
+        copy.write_text("nothing")
+    elif how in ("no actions", "nan"):
+        with h5py.File(copy, "a") as file:
+            group: Any = file["traj_0"]
+            if how == "nan":
+                group["actions"][3] = np.nan
+            else:
+                del group["actions"]
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ("no index", "is missing: the index"),
+        ("no json", "is not valid JSON"),
+        ("list", "is no index of a ManiSkill recording"),
+        ("stock", "unknown environment 'PickCube-v1'"),
+        ("empty", "has no episode"),
+        ("number", "has an episode with the number '../x'"),
+        ("text", "has no intact episode traj_0"),
+        ("no actions", "has no intact episode traj_0"),
+        ("nan", "are no table of finite numbers"),
+    ],
+)
+def test_a_file_that_is_no_recording_is_refused(recording: Path, tmp_path: Path, how: str, words: str):
+    path = damaged(recording, tmp_path, how)
+    with pytest.raises(InputError, match=words):
+        Recording.open(path).episode(0)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="There is no trajectory file"):
+        Recording.open(tmp_path / "none.h5")
+
+
+def test_a_damaged_recording_leaves_the_present_player(recording: Path, tmp_path: Path):
+    broken = recorded(Recording.open(damaged(recording, tmp_path, "nan")))
+    watched = Watched("DoraCube-v1", [zero_correction({}), broken], preset="none")
+    state = watched.do(Play(broken.name))
+    assert state.player == ZERO
+    assert "are no table of finite numbers" in state.message
+    assert watched.steps(2).episode.step == 2
+    watched.session.stop()
