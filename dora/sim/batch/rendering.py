@@ -1,12 +1,17 @@
-"""Whether this machine can render, and stand-ins for the materials that tasks make even where nothing can."""
+"""Whether this machine can render and who needs it, and stand-ins for materials where nothing can be rendered."""
 
 from functools import cache
-from typing import Any
+from typing import Any, NoReturn
 
 import sapien
 from mani_skill.utils.building import _mjcf_loader
 from sapien import pysapien
 from sapien.wrapper import urdf_loader
+
+from dora.errors import InputError
+
+STATE_MODES = ("state", "state_dict", "none")
+"""Observation modes that need no renderer; others may join them with "+"."""
 
 
 class NoMaterial:
@@ -34,6 +39,27 @@ def can_render() -> bool:
     except RuntimeError:
         return False
     return True
+
+
+def wants_pictures(obs_mode: str | None) -> bool:
+    """Whether an observation mode has pictures, or what is made of them; None is the mode of a task, without any."""
+    return obs_mode is not None and not set(obs_mode.split("+")) <= set(STATE_MODES)
+
+
+def refuse_pictures(obs_mode: str | None, render_mode: str | None) -> NoReturn:
+    """Says that pictures are needed that nothing here can draw.
+
+    Raises:
+        InputError: always.
+    """
+    wish = f"obs_mode {obs_mode!r}" if wants_pictures(obs_mode) else f"render_mode {render_mode!r}"
+    if can_render():
+        why, mend = "render_backend is 'none'", "leave render_backend out"
+    else:
+        why, mend = "SAPIEN finds no Vulkan driver", "install one, such as Mesa's (docs/rendering.md)"
+    raise InputError(
+        f'{wish} needs pictures, but {why}: {mend}, or use obs_mode "state" and no render_mode, which need none.'
+    )
 
 
 def replace_materials() -> None:
