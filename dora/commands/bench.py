@@ -24,6 +24,7 @@ def bench_env(
     num_envs: int = 256,
     workers: int = available_cores(),
     seconds: float = 10.0,
+    obs_mode: str = "state",
     json: bool = False,
 ) -> None:
     """Environment steps per second with random actions, against an AsyncVectorEnv of single environments.
@@ -33,9 +34,10 @@ def bench_env(
         num_envs: environments in each process.
         workers: processes (default: one per core).
         seconds: length of each of the four measurements [s].
+        obs_mode: what is observed, such as state, rgb or rgb+depth+segmentation; pictures need a Vulkan driver.
         json: print one JSON object on the last line instead of a table.
     """
-    report(dataclasses.asdict(benchmark.measure(env, num_envs, workers, seconds)), json)
+    report(dataclasses.asdict(benchmark.measure(env, num_envs, workers, seconds, obs_mode)), json)
 
 
 @app.command(name="grasp")

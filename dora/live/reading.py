@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float
 
 from dora.live.state import Forces, Goal, History, Setup
-from dora.tasks.env.env import MM, DoraEnv
+from dora.tasks.env.env import DoraEnv
+from dora.tasks.mdp.memory import MM
 
 REWARD = "reward/"
 """What the names of a reward's terms begin with in the info of a step."""

@@ -30,7 +30,9 @@ RENDER_BACKENDS = ("none", *backends.render_backend_name_mapping)
 TEXTURES = tuple(field.name for field in dataclasses.fields(CameraObsTextures))
 """Observations of cameras, which an `obs_mode` may join with "+"."""
 MODES_OF_PICTURES = ("rgbd", *TEXTURES)
-"""What an `obs_mode` may be or join besides a task's own modes."""
+"""What an `obs_mode` may be besides a task's own modes."""
+ALONE = ("rgbd", "sensor_data")
+"""Modes that ManiSkill does not join with others."""
 SETTINGS = ("sensor_configs", "human_render_camera_configs", "viewer_camera_configs")
 """Keywords that take dictionaries."""
 
@@ -188,9 +190,14 @@ def _check_modes(cls: Any, kwargs: Mapping[str, Any]) -> None:
     pictures = MODES_OF_PICTURES if "any_textures" in cls.SUPPORTED_OBS_MODES else ()
     mode = kwargs.get("obs_mode")
     if mode is not None and mode not in own:
-        for part in mode.split("+"):
+        parts = mode.split("+")
+        for part in parts:
             if part not in (*pictures, *own):
                 raise InputError(f"there is no obs_mode {mode!r}: {suggestion(part, (*own, *pictures))}")
+            if part in ALONE and len(parts) > 1:
+                raise InputError(
+                    f"the obs_mode {part!r} cannot be joined, as in {mode!r}: join textures, as rgb+depth."
+                )
     choices = {
         "reward_mode": cls.SUPPORTED_REWARD_MODES,
         "render_mode": cls.SUPPORTED_RENDER_MODES,

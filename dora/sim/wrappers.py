@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from mani_skill import logger
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.utils import common, tree
+from mani_skill.utils import common, sapien_utils, tree
 from mani_skill.utils.registration import TimeLimitWrapper
 from mani_skill.utils.wrappers import record
 from mani_skill.utils.wrappers.cached_reset import CachedResetWrapper
@@ -22,6 +22,7 @@ from dora.configs import plain
 from dora.errors import InputError
 from dora.sim.batch.hooks import BACKEND
 from dora.sim.batch.resets import checked_options
+from dora.sim.cameras import check_cameras, check_names, check_settings, check_shown
 from dora.sim.robot_agent import DescribedRobot
 
 PACKAGE = "dora"
@@ -44,6 +45,8 @@ def install_wrappers() -> None:
         (common, "_batch", _batch),
         (CachedResetWrapper, "__init__", _cache),
         (BaseEnv, "render", _render),
+        (BaseEnv, "_setup_sensors", _setup_sensors),
+        (sapien_utils, "create_viewer", _create_viewer),
     ):
         original = getattr(owner, name)
         setattr(owner, name, wraps(original)(wrapper(original)))
@@ -118,9 +121,42 @@ def _render(original: Callable) -> Callable:
                 "nothing can be rendered: SAPIEN finds no Vulkan driver (see docs/rendering.md), or render_backend is "
                 f"{self.backend.render_backend!r}."
             )
+        if self.render_mode == "sensors" and _is_ours(self):
+            check_shown(self)
         return original(self, *args, **kwargs)
 
     return render
+
+
+def _setup_sensors(original: Callable) -> Callable:
+    def setup_sensors(self: BaseEnv, options: dict) -> None:
+        """ManiSkill's, or an InputError where a camera is not as it has to be or a picture would be missing."""
+        if not _is_ours(self):
+            return original(self, options)
+        configs = self._custom_sensor_configs or {}
+        check_settings(configs)
+        try:
+            original(self, options)
+        except (AttributeError, AssertionError):
+            check_names(configs, self._sensor_configs)
+            raise
+        check_cameras(self)
+
+    return setup_sensors
+
+
+def _create_viewer(original: Callable) -> Callable:
+    def create_viewer(*args: Any, **kwargs: Any) -> Any:
+        """ManiSkill's window, or an InputError where none can be opened."""
+        try:
+            return original(*args, **kwargs)
+        except RuntimeError as error:
+            raise InputError(
+                f'render_mode "human" opens a window, and none can be opened here ({error}): use a machine with a '
+                'display, or render_mode "rgb_array".'
+            ) from error
+
+    return create_viewer
 
 
 # ---- recording -----------------------------------------------------------------------------------

@@ -20,11 +20,12 @@ from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.feasibility_table import Grid
 from dora.geometry.rotations import quaternion_apply, quaternion_multiply
+from dora.sim.cameras import CameraSpec
 from dora.tasks.env.arm import ArmSpec
 from dora.tasks.env.registration import register_task
 from dora.tasks.env.scene import TaskScene
 from dora.tasks.env.starts import STANDING_DRAWS, standing
-from dora.tasks.env.task import Task
+from dora.tasks.env.task import HAND_CAMERA, Task
 from dora.tasks.mdp.config import PenaltyWeights, TaskConfig
 from dora.tasks.mdp.mdp import Mdp
 from dora.tasks.mdp.observations import Entry
@@ -117,6 +118,10 @@ class CubeTask(Task):
     ARMS: ClassVar[Mapping[str, ArmSpec]] = {"arm": ArmSpec("cube")}
     DRAWS = STANDING_DRAWS
     MAX_STEPS = 100
+    CAMERAS: ClassVar[Mapping[str, CameraSpec]] = {
+        "hand_camera": HAND_CAMERA,
+        "front_camera": CameraSpec(eye=(0.95, -0.6, 0.28), target=(0.53, 0.0, 0.18), fov=0.8),
+    }
     LEARNERS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "ppo": {
             "total_steps": 300_000, "stop_success": 0.99, "num_envs": 64, "eval_every": 40_000, "eval_episodes": 50,

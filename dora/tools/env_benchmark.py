@@ -3,6 +3,7 @@
 import difflib
 import multiprocessing
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,7 +18,8 @@ from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 import dora  # noqa: F401  (registers Dora's tasks)
 from dora.errors import InputError
 from dora.parallel import run_cases
-from dora.sim import BACKEND, StepProfile
+from dora.sim import BACKEND, StepProfile, can_render
+from dora.sim.batch.rendering import refuse_pictures, wants_pictures
 
 MOST: dict[str, float] = {"num_envs": 100_000, "workers": 512, "seconds": 86_400}
 """Largest value of each number of a measurement."""
@@ -29,8 +31,6 @@ _WARM_UP_STEPS = 10
 """Control steps before a measurement [1]."""
 _START_TIMEOUT = 300.0
 """Longest time to build all environments [s]."""
-_TASK: dict[str, Any] = {"obs_mode": "state", "render_backend": "none"}
-"""Options of every environment that is measured."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class EnvReport:
     ``ratio`` is ``env_steps_per_second`` over ``reference_env_steps_per_second``; ``physics_share`` the
     part of our step that is PhysX; ``shares`` all parts (``other`` is torch, ManiSkill and resets);
     ``cpu_microseconds`` the processor time of one environment step; ``seconds`` the length of each
-    measurement.
+    measurement; ``pictures_per_second`` those of all cameras of ours, resets included, 0 without pictures.
     """
 
     env: str
@@ -53,6 +53,8 @@ class EnvReport:
     seconds: float
     reference_processes: int
     cpu_microseconds: float
+    obs_mode: str = "state"
+    pictures_per_second: float = 0.0
     shares: dict[str, float] = field(default_factory=dict)
 
 
@@ -61,10 +63,11 @@ class _Measured:
     steps: int
     seconds: float
     cpu_seconds: float
+    pictures: int
     shares: dict[str, float]
 
 
-def measure(env_id: str, num_envs: int, workers: int, seconds: float) -> EnvReport:
+def measure(env_id: str, num_envs: int, workers: int, seconds: float, obs_mode: str = "state") -> EnvReport:
     """Measure ours, then the reference with each of ``REFERENCE_PROCESSES``.
 
     Args:
@@ -72,9 +75,10 @@ def measure(env_id: str, num_envs: int, workers: int, seconds: float) -> EnvRepo
         num_envs: environments in each of our processes.
         workers: our processes.
         seconds: length of each measurement.
+        obs_mode: what is observed, in ours and in the reference; any of ManiSkill's.
 
     Raises:
-        InputError: if a number is not positive or there is no such task.
+        InputError: if a number is not positive, there is no such task or observation, or no driver for pictures.
     """
     for name, value in (("num_envs", num_envs), ("workers", workers), ("seconds", seconds)):
         if not 0 < value <= MOST[name]:
@@ -84,12 +88,14 @@ def measure(env_id: str, num_envs: int, workers: int, seconds: float) -> EnvRepo
         near = difflib.get_close_matches(env_id, gym.registry, 1)
         hint = f"did you mean {near[0]}?" if near else "see gymnasium.registry for the ids."
         raise InputError(f"There is no task {env_id!r}: {hint}")
+    if wants_pictures(obs_mode) and not can_render():
+        refuse_pictures(obs_mode, None)
     together = multiprocessing.get_context("spawn").Barrier(workers)
-    arguments = (env_id, num_envs, seconds, together)
+    arguments = (env_id, obs_mode, num_envs, seconds, together)
     ours = run_cases(_Measurement, arguments, range(workers), workers, chunk=1)  # the barrier gives each process one
     rate = sum(part.steps / part.seconds for part in ours)
     shares = {name: float(np.mean([part.shares[name] for part in ours])) for name in ours[0].shares}
-    references = {count: _reference_rate(env_id, count, seconds) for count in REFERENCE_PROCESSES}
+    references = {count: _reference_rate(env_id, obs_mode, count, seconds) for count in REFERENCE_PROCESSES}
     best = max(references, key=lambda count: references[count])
     return EnvReport(
         env=env_id,
@@ -102,16 +108,24 @@ def measure(env_id: str, num_envs: int, workers: int, seconds: float) -> EnvRepo
         seconds=seconds,
         reference_processes=best,
         cpu_microseconds=1e6 * sum(part.cpu_seconds for part in ours) / sum(part.steps for part in ours),
+        obs_mode=obs_mode,
+        pictures_per_second=sum(part.pictures / part.seconds for part in ours),
         shares=shares,
     )
+
+
+def _options(obs_mode: str) -> dict[str, Any]:
+    """Options of every environment that is measured."""
+    drawn = "gpu" if torch.cuda.is_available() else "cpu"
+    return {"obs_mode": obs_mode, "render_backend": drawn if wants_pictures(obs_mode) else "none"}
 
 
 class _Measurement:
     """Builds environments, and steps them as long as all processes of a barrier do."""
 
-    def __init__(self, env_id: str, num_envs: int, seconds: float, together: Any):
+    def __init__(self, env_id: str, obs_mode: str, num_envs: int, seconds: float, together: Any):
         torch.set_num_threads(1)
-        self.env: Any = gym.make(env_id, num_envs=num_envs, sim_backend=BACKEND, **_TASK)
+        self.env: Any = gym.make(env_id, num_envs=num_envs, sim_backend=BACKEND, **_options(obs_mode))
         self.num_envs, self.seconds, self.together = num_envs, seconds, together
 
     def __call__(self, seed: int) -> _Measured:
@@ -119,11 +133,26 @@ class _Measurement:
         self.env.unwrapped.scene.px.profile = profile = StepProfile()
         for _ in range(_WARM_UP_STEPS):
             step()
+        used = _uses_of_cameras(self.env.unwrapped)
         self.together.wait(_START_TIMEOUT)
         profile.clear()
         cpu = time.process_time()
         rounds, elapsed = _repeat(step, self.seconds)
-        return _Measured(rounds * self.num_envs, elapsed, time.process_time() - cpu, profile.shares())
+        cpu = time.process_time() - cpu
+        n = self.num_envs
+        return _Measured(rounds * n, elapsed, cpu, used.total() * n, profile.shares())
+
+
+def _uses_of_cameras(env: Any) -> Counter[str]:
+    """How often each camera of observations takes pictures from now on, of all environments at once."""
+    used, capture = Counter(), env.capture_sensor_data
+
+    def counted() -> None:
+        used.update(env._sensors.keys())
+        capture()
+
+    env.capture_sensor_data = counted
+    return used
 
 
 def _random_stepper(env: Any, num_envs: int, seed: int) -> Callable[[], None]:
@@ -152,14 +181,14 @@ def _repeat(step: Callable[[], None], seconds: float) -> tuple[int, float]:
     return rounds, elapsed
 
 
-def _single_env(env_id: str) -> gym.Env:
+def _single_env(env_id: str, obs_mode: str) -> gym.Env:
     torch.set_num_threads(1)
-    return CPUGymWrapper(gym.make(env_id, num_envs=1, sim_backend="physx_cpu", **_TASK))
+    return CPUGymWrapper(gym.make(env_id, num_envs=1, sim_backend="physx_cpu", **_options(obs_mode)))
 
 
-def _reference_rate(env_id: str, processes: int, seconds: float) -> float:
+def _reference_rate(env_id: str, obs_mode: str, processes: int, seconds: float) -> float:
     """Environment steps per second of an `AsyncVectorEnv`, which resets ended episodes within the step as ours."""
-    makers = [lambda: _single_env(env_id)] * processes
+    makers = [lambda: _single_env(env_id, obs_mode)] * processes
     env = AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
     try:
         env.action_space.seed(0)

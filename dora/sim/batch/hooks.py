@@ -17,7 +17,7 @@ from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.system.backend import BackendInfo
-from mani_skill.utils.structs import Articulation, ArticulationJoint
+from mani_skill.utils.structs import Actor, Articulation, ArticulationJoint
 from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
 from sapien import physx
 
@@ -25,15 +25,13 @@ from dora.errors import InputError
 from dora.sim.batch import resets
 from dora.sim.batch.actions import check_action, finite_rows, plain_action
 from dora.sim.batch.guard import StateGuard, marked
-from dora.sim.batch.rendering import can_render, replace_materials
+from dora.sim.batch.rendering import can_render, refuse_pictures, replace_materials, wants_pictures
 from dora.sim.batch.scene import BatchScene
 
 BACKEND = "physx_cpu_batch"
 """Name of the back end as `sim_backend`."""
 SUPPORTED = {"mani_skill": "3.0.1", "sapien": "3.0.3"}
 """Versions for which the wrappers are written, by package."""
-STATE_MODES = ("state", "state_dict", "none")
-"""Observation modes that need no renderer."""
 
 _installed = False
 
@@ -64,6 +62,8 @@ def install() -> None:
         (BaseEnv, "set_state_dict", partial(_where_batched, resets.set_state_dict)),
         (Articulation, "get_collision_meshes", _get_meshes),
         (Articulation, "get_visual_meshes", _get_meshes),
+        (Actor, "hide_visual", partial(_set_visible, 0.0)),
+        (Actor, "show_visual", partial(_set_visible, 1.0)),
         (PDEEPosController, "set_action", _set_pose_action),
         (Kinematics, "compute_ik", _compute_ik),
     ):
@@ -143,11 +143,8 @@ def _setup_scene(original: Callable) -> Callable:
         if not runs_batched(self):
             return original(self)
         renderers = [] if self._render_device is None else [self._render_device]
-        if not renderers and self._obs_mode not in STATE_MODES:
-            raise InputError(
-                f"obs_mode {self._obs_mode!r} needs a renderer and there is none: install a Vulkan driver, "
-                f"such as Mesa's, and leave render_backend alone, or choose one of {', '.join(STATE_MODES)}."
-            )
+        if not renderers and (wants_pictures(self._obs_mode) or self.render_mode == "human"):
+            refuse_pictures(self._obs_mode, self.render_mode)
         if not renderers and self.render_mode is not None:
             logger.warning(f"render_mode {self.render_mode!r} has no effect because there is no renderer.")
         self._set_scene_config()
@@ -249,6 +246,19 @@ def _get_meshes(original: Callable) -> Callable:
             self.scene._gpu_sim_initialized = False
 
     return get_meshes
+
+
+def _set_visible(visibility: float, original: Callable) -> Callable:
+    """Hides and shows actors by their visibility, as on a CPU; on a GPU ManiSkill moves them 100 km away."""
+
+    def set_visible(self: Actor) -> None:
+        if not isinstance(self.scene, BatchScene):
+            return original(self)
+        for entity in self._objs:
+            body: Any = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+            body.visibility = visibility
+
+    return set_visible
 
 
 def _set_pose_action(original: Callable) -> Callable:

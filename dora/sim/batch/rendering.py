@@ -1,8 +1,8 @@
-"""Whether this machine can render, and stand-ins for the materials that tasks make even where nothing can."""
+"""Whether this machine can render and who needs it, and stand-ins for materials where nothing can be rendered."""
 
 import multiprocessing
 from functools import cache
-from typing import Any
+from typing import Any, NoReturn
 
 import sapien
 from mani_skill import logger
@@ -10,10 +10,14 @@ from mani_skill.utils.building import _mjcf_loader
 from sapien import pysapien
 from sapien.wrapper import urdf_loader
 
+from dora.errors import InputError
+
 QUIET, USUAL = "off", "warn"
 """Levels of SAPIEN's log of rendering: nothing, and what it is when SAPIEN is imported."""
 NOTE = "There is no Vulkan driver: everything works but pictures and films (docs/rendering.md says how to get one)."
 """What is said once instead of the three lines that SAPIEN logs where it finds no driver."""
+STATE_MODES = ("state", "state_dict", "none")
+"""Observation modes that need no renderer; others may join them with "+"."""
 
 
 class NoMaterial:
@@ -50,6 +54,27 @@ def can_render() -> bool:
     finally:
         sapien.render.set_log_level(USUAL)
     return True
+
+
+def wants_pictures(obs_mode: str | None) -> bool:
+    """Whether an observation mode has pictures, or what is made of them; None is the mode of a task, without any."""
+    return obs_mode is not None and not set(obs_mode.split("+")) <= set(STATE_MODES)
+
+
+def refuse_pictures(obs_mode: str | None, render_mode: str | None) -> NoReturn:
+    """Says that pictures are needed that nothing here can draw.
+
+    Raises:
+        InputError: always.
+    """
+    wish = f"obs_mode {obs_mode!r}" if wants_pictures(obs_mode) else f"render_mode {render_mode!r}"
+    if can_render():
+        why, mend = "render_backend is 'none'", "leave render_backend out"
+    else:
+        why, mend = "SAPIEN finds no Vulkan driver", "install one, such as Mesa's (docs/rendering.md)"
+    raise InputError(
+        f'{wish} needs pictures, but {why}: {mend}, or use obs_mode "state" and no render_mode, which need none.'
+    )
 
 
 def replace_materials() -> None:

@@ -4,6 +4,7 @@ It reads the simulator once per control step; then only pure functions of that s
 """
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, ClassVar, cast
 
 import gymnasium as gym
@@ -22,24 +23,21 @@ from dora.affordance.reach.feasibility_table import ReachTable
 from dora.sim.batch.actions import checked_action
 from dora.sim.batch.hooks import mend, runs_batched
 from dora.sim.batch.resets import nothing_reset
+from dora.sim.cameras import camera_configs
 from dora.tasks.env.arm import Arm
 from dora.tasks.env.arm_group import ArmGroup
 from dora.tasks.env.description import describe
 from dora.tasks.env.episode_start import begin_episodes, drawn_sizes, requested
 from dora.tasks.env.options import check_grasps, check_options, task_config
-from dora.tasks.env.perturbations import Perturbations
 from dora.tasks.env.scene import TaskScene, film_camera, sim_config
 from dora.tasks.env.state import saved_state, set_rows, unflattened
 from dora.tasks.env.task import Task
 from dora.tasks.guidance.guide import Guide
 from dora.tasks.mdp.guidance_parts import FILTER
-from dora.tasks.mdp.observations import observation_table
+from dora.tasks.mdp.observations import joined, observation_table, observed_part
 from dora.tasks.mdp.rewards import Terms
 from dora.tasks.mdp.snapshot import Snapshot, advanced
 from dora.tasks.mdp.stages import StageMachine
-
-MM = 1000.0
-"""Millimetres per metre."""
 
 
 class DoraEnv(BaseEnv):
@@ -133,6 +131,11 @@ class DoraEnv(BaseEnv):
         return sim_config(self.config)
 
     @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        wrists = {name: arm.agent.wrist for name, arm in self.arms.items()}
+        return camera_configs(self.task.CAMERAS, wrists, self.obs_mode_struct)
+
+    @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
         return film_camera(*self.task.CAMERA)
 
@@ -154,14 +157,11 @@ class DoraEnv(BaseEnv):
         terms = self.mdp.paper_terms if self._reward_mode == "paper" else self.mdp.terms
         self.terms: Terms[Any] = terms.in_force(self.parts)
         self.observation_entries = observation_table(tuple(task.ARMS), self.mdp.observations, self.parts)
-        agents = getattr(self.agent, "agents", [self.agent])
-        scene.make_arms(task, agents, self.parts, self._grasps, self._tables)
+        scene.make_arms(task, getattr(self.agent, "agents", [self.agent]), self.parts, self._grasps, self._tables)
         self.anneal(**self._shares)
         scene.make_reader(task)
         self.memory = scene.make_memory(self.action_size)
-        hands = {name: len(arm.agent.description.hand) for name, arm in self.arms.items()}
-        size = self.num_envs, self.action_size
-        self.perturbations = Perturbations(self.config.randomisation, *size, hands, self.config.dt, self.device)
+        self.perturbations = scene.make_perturbations(self.action_size)
 
     def rebuild(self, scale: Float[Tensor, "n objects"]) -> None:
         """Builds the scene anew with objects of these relative sizes; begins new episodes."""
@@ -183,6 +183,11 @@ class DoraEnv(BaseEnv):
     def arms(self) -> ArmGroup:
         """The arms by name."""
         return self.task_scene.arms
+
+    @cached_property
+    def segmentation_id_map(self) -> dict[int, Any]:
+        """The objects and links by their numbers in pictures of segmentation, which are the same in all rows."""
+        return {**super().segmentation_id_map, **{body._objs[0].per_scene_id: body for body in self.objects.values()}}
 
     @property
     def target_object(self) -> Actor:
@@ -312,17 +317,8 @@ class DoraEnv(BaseEnv):
         Idempotent: reset and wrappers call it too, so it moves nothing.
         """
         s, memory, finished, unreachable = self.snapshot, self.memory, self.machine.finished, self.unreachable
-        info = {
-            **self.mdp.verdict(finished, unreachable, s, memory),
-            "unreachable": unreachable,
-            "finished": finished,
-            "stage": self.machine.index.clone(),
-            "penetration_mm": memory.episode.penetration * MM,
-            "penetration_max_mm": memory.max_penetration * MM,
-        }
-        for k, stage in enumerate(self.machine.stages):
-            info[f"stage/{stage.name}"] = self.machine.furthest > k
-        return info
+        verdict = self.mdp.verdict(finished, unreachable, s, memory)
+        return {**verdict, "unreachable": unreachable, **self.machine.report(), **memory.report()}
 
     def compute_dense_reward(self, obs: Any, action: Any, info: dict) -> Tensor:
         """Sum of the terms (n,); each one's share goes into `info["reward/<name>"]`."""
@@ -344,14 +340,18 @@ class DoraEnv(BaseEnv):
     # ------------------------------------------------------------- observation
 
     def _get_obs_agent(self) -> dict[str, Tensor]:
-        return {}
+        return observed_part(self.observation_entries, self.observed, sensed=True)
 
     def _get_obs_extra(self, info: dict) -> dict[str, Tensor]:
-        s = self.observed
-        return {name: entry.value(s) for name, entry in self.observation_entries.items()}
+        privileged = self.obs_mode_struct.use_state
+        return observed_part(self.observation_entries, self.observed, sensed=False) if privileged else {}
 
     def _flatten_raw_obs(self, obs: Any) -> Any:
-        return torch.cat([*obs["extra"].values()], -1) if self._obs_mode == "state" else super()._flatten_raw_obs(obs)
+        if not self.obs_mode_struct.state:
+            return obs
+        state = joined(self.observation_entries, obs)
+        pictures = {name: part for name, part in obs.items() if name not in ("agent", "extra")}
+        return {**pictures, "state": state} if pictures else state
 
     # ------------------------------------------------ the protocol of learners
 

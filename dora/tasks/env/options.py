@@ -11,16 +11,13 @@ from dora.affordance.candidates import GraspCandidates
 from dora.configs import check_finite, check_not_negative, check_ranges, overridden
 from dora.errors import InputError, shown
 from dora.robot import available_robots
-from dora.sim.batch.hooks import STATE_MODES
-from dora.sim.batch.rendering import can_render
+from dora.sim.batch.rendering import can_render, refuse_pictures, wants_pictures
 from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot
 from dora.sim.robots import register_robot
 from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import guidance_in_force
 from dora.tasks.mdp.randomisation import find_preset
 
-STATE_MODES_OR_DEFAULT = (None, *STATE_MODES)
-"""Observation modes that need no pictures, with that of a task that is asked for none."""
 RATES = {"control_frequency": (1, 10_000), "physics_frequency": (1, 1_000_000), "solver_iterations": (1, 255)}
 """Lowest and highest rates [Hz], and position iterations, of which PhysX takes 255."""
 MOST_DELAY = 1000
@@ -81,7 +78,7 @@ def check_options(
     num_envs: Any,
     control_mode: str | None,
     sim_backend: str,
-    render_backend: str,
+    render_backend: str | None,
     render_mode: str | None,
     obs_mode: str | None,
 ) -> TaskOptions:
@@ -109,8 +106,7 @@ def check_options(
         raise InputError(f"unknown control mode {control_mode!r}; choose one of {', '.join(known)}")
     if sim_backend == "auto" and not torch.cuda.is_available():
         sim_backend = "physx_cpu_batch" if num_envs > 1 else "physx_cpu"
-    if render_backend == "auto":
-        render_backend = choose_render_backend(render_mode, obs_mode)
+    render_backend = choose_render_backend(render_backend, render_mode, obs_mode)
     return TaskOptions(parts, config, robots, mode, sim_backend, render_backend)
 
 
@@ -140,23 +136,22 @@ def _robots(robot_uids: Any, arms: int) -> tuple[str, ...]:
     return tuple(names)
 
 
-def choose_render_backend(render_mode: str | None, obs_mode: str | None) -> str:
-    """The render backend for a task: "none" unless a picture can be asked for and there is a Vulkan driver.
+def choose_render_backend(render_backend: str | None, render_mode: str | None, obs_mode: str | None) -> str:
+    """The render backend for a task: "none" where no picture can be asked for, or nothing can draw it.
 
     ManiSkill's tools ask for a `render_mode` whether they draw or not, so that one alone is no reason to refuse, but
     for "human"; `render` does where nothing can be drawn.
 
     Raises:
-        InputError: if observations are pictures or a window is wanted, and there is no Vulkan driver.
+        InputError: if observations are pictures or a window is wanted, and there is no Vulkan driver or
+            `render_backend` is "none".
     """
-    if render_mode is None and obs_mode in STATE_MODES_OR_DEFAULT:
+    needed = wants_pictures(obs_mode) or render_mode == "human"
+    if render_backend == "auto" and not needed and render_mode is None:
         return "none"
-    if can_render():
-        return "gpu" if torch.cuda.is_available() else "cpu"
-    if obs_mode not in STATE_MODES_OR_DEFAULT or render_mode == "human":
-        wish = 'render_mode "human"' if render_mode == "human" else f"obs_mode {obs_mode!r}"
-        raise InputError(
-            f"{wish} needs pictures, but SAPIEN finds no Vulkan driver: install one "
-            '(docs/rendering.md), or leave render_mode at None and obs_mode at "state"'
-        )
+    if render_backend not in ("none", None) and can_render():
+        default = "gpu" if torch.cuda.is_available() else "cpu"
+        return default if render_backend == "auto" else render_backend
+    if needed:
+        refuse_pictures(obs_mode, render_mode)
     return "none"

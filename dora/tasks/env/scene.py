@@ -21,6 +21,7 @@ from dora.sim.properties import ObjectProperties
 from dora.sim.robot_agent import DescribedRobot
 from dora.tasks.env.arm import Arm
 from dora.tasks.env.arm_group import ArmGroup
+from dora.tasks.env.perturbations import Perturbations
 from dora.tasks.env.state_reader import StateReader
 from dora.tasks.env.table import add_table
 from dora.tasks.env.task import Task
@@ -140,6 +141,12 @@ class TaskScene:
         parts = {name: 1 + len(arm.agent.description.fingers) for name, arm in self.arms.items()}
         hands = {name: HandSizes(count, self.reader.points) for name, count in parts.items()}
         return EpisodeMemory(self.num_envs, action_size, hands, tuple(self.objects), self.device)
+
+    def make_perturbations(self, action_size: int) -> Perturbations:
+        """Noise, delay and pushes of the randomisation for these arms."""
+        hands = {name: len(arm.agent.description.hand) for name, arm in self.arms.items()}
+        c = self.config
+        return Perturbations(c.randomisation, self.num_envs, action_size, hands, c.dt, self.device)
 
     def snapshot(self, machine: StageMachine, memory: EpisodeMemory, time: Float[Tensor, " n"]) -> Snapshot:
         """The state now; arguments as of `StateReader.snapshot`."""

@@ -14,6 +14,7 @@ from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.reach.feasibility_table import Grid
 from dora.robot import RobotDescription
+from dora.sim.cameras import CameraSpec
 from dora.sim.shapes import DrawnShape
 from dora.tasks.env.arm import Arm, ArmSpec
 from dora.tasks.env.starts import STANDING_DRAWS, ChosenStarts, standing_starts
@@ -30,6 +31,10 @@ if TYPE_CHECKING:
 
 HELD_RISE = 0.1
 """Rise of an object that is held up [m]."""
+HAND_CAMERA = CameraSpec(eye=(0.10, 0.0, -0.06), target=(0.06, 0.0, 0.16), up=(1.0, 0.0, 0.0), on_hand=True)
+"""Camera above the palm near the wrist, which looks along the fingers at what they grasp."""
+FRONT_CAMERA = CameraSpec(eye=(1.0, -0.65, 0.42), target=(0.5, 0.0, 0.2), fov=0.85)
+"""Camera in front of the arm, to the side of the little finger: from straight ahead the hand hides what it holds."""
 
 
 class Task(ABC):
@@ -61,6 +66,8 @@ class Task(ABC):
         (0.42, 0.02, 0.2),
     )
     """Eye and target of the camera of films [m]."""
+    CAMERAS: ClassVar[Mapping[str, CameraSpec]] = {"hand_camera": HAND_CAMERA, "front_camera": FRONT_CAMERA}
+    """The cameras of observations by name: one on each hand, which moves with it, and one in front of the arm."""
 
     def __init__(self, config: Any):
         self.config = config

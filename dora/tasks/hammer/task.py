@@ -19,12 +19,13 @@ from dora.affordance.objects.catalogue import load_object
 from dora.geometry.poses import relative
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
 from dora.robot import RobotDescription
+from dora.sim.cameras import CameraSpec
 from dora.sim.shapes import DrawnShape
 from dora.tasks.env.arm import Arm, ArmSpec, start_posture
 from dora.tasks.env.registration import register_task
 from dora.tasks.env.scene import TaskScene
 from dora.tasks.env.starts import ChosenStarts, StartNumber
-from dora.tasks.env.task import Task
+from dora.tasks.env.task import HAND_CAMERA, Task
 from dora.tasks.guidance.reference import Reference
 from dora.tasks.hammer.ballistics import Strike
 from dora.tasks.hammer.mdp import failed, paper_terms, stages, terms
@@ -164,6 +165,10 @@ class HammerTask(Task):
     CONTACT_EVERY_STEP = True
     WRIST_MOTION = (1.5, 6.0)
     CAMERA = ((1.15, 0.65, 0.75), (0.48, -0.12, 0.42))
+    CAMERAS: ClassVar[Mapping[str, CameraSpec]] = {
+        "hand_camera": HAND_CAMERA,
+        "front_camera": CameraSpec(eye=(1.25, 0.5, 0.7), target=(0.48, -0.1, 0.5), fov=0.95),
+    }
     LEARNERS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "sac": {
             "total_steps": 300_000, "stop_success": 0.97, "num_envs": 32, "eval_every": 75_000, "eval_episodes": 100,
@@ -327,6 +332,6 @@ OBSERVATIONS: dict[str, Entry] = {
     "handle": Entry(tip_distance, "m", "distance of each fingertip's surface from the handle's", True, region=True),
     "face": Entry(face_to_nail, "m", "striking face to the nail's head, world frame", True, region=True),
     "axes": Entry(_axes, "1", "striking and handle axis, world frame", True, region=True),
-    "nail_axis": Entry(_nail_axis, "1", "nail axis in the hand frame", True, region=True),
+    "nail_axis": Entry(_nail_axis, "1", "nail axis in the hand frame", True, region=True, sensed=True),
 }
 """What the task observes beyond the common entries; the guided ones are the affordance frame."""

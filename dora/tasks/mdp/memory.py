@@ -9,6 +9,9 @@ from torch import Tensor
 
 from dora.tasks.mdp.buffers import Buffers
 
+MM = 1000.0
+"""Millimetres per metre."""
+
 
 @dataclass(frozen=True)
 class HandSizes:
@@ -92,6 +95,10 @@ class EpisodeMemory:
     def record_action(self, action: Float[Tensor, "n a"]) -> None:
         """Shifts the action history by one."""
         self.episode.update(previous_action=self.episode.action, action=action)
+
+    def report(self) -> dict[str, Float[Tensor, " n"]]:
+        """For `info`: overlap of the last control step and largest of the episode [mm]."""
+        return {"penetration_mm": self.episode.penetration * MM, "penetration_max_mm": self.max_penetration * MM}
 
     def _parts(self) -> dict[str, Buffers]:
         hands = {f"hand.{arm}": part for arm, part in self.hands.items()}

@@ -33,6 +33,8 @@ class Entry:
         region: True if it exists only with `guidance="affordance"`, because it knows the object's regions.
         prior: True if it is about the reference to which the action is a residual; it exists only with that part of
             guidance, all other guided entries belong to the part "observation".
+        sensed: True if a robot knows it without looking: its joints, its commands, touch. It stays an observation
+            beside pictures; all other entries are privileged, and left out where pictures are observed without state.
     """
 
     value: Callable[[Any], Tensor]
@@ -41,6 +43,7 @@ class Entry:
     guided: bool = False
     prior: bool = False
     region: bool = False
+    sensed: bool = False
 
     def exists(self, parts: frozenset[str]) -> bool:
         """Whether the entry exists with these parts of guidance."""
@@ -66,6 +69,23 @@ def observation_table(arms: Sequence[str], extra: Mapping[str, Entry], parts: fr
         }
         table = {**own, **{name: ARM_ENTRIES[name] for name in SHARED_ENTRIES}}
     return {name: entry for name, entry in table.items() if entry.exists(parts)}
+
+
+def observed_part(entries: Mapping[str, Entry], s: Snapshot, sensed: bool) -> dict[str, Tensor]:
+    """Entries (n, k) by name: what the robot senses, which ManiSkill calls `agent`, or the privileged ones, `extra`.
+
+    Args:
+        entries: the table in force.
+        s: the state as it is observed.
+        sensed: which of the two.
+    """
+    return {name: entry.value(s) for name, entry in entries.items() if entry.sensed == sensed}
+
+
+def joined(entries: Mapping[str, Entry], parts: Mapping[str, Mapping[str, Tensor]]) -> Tensor:
+    """The observation vector (n, o): all entries in the order of the table, of the parts `agent` and `extra`."""
+    values = {**parts["agent"], **parts["extra"]}
+    return torch.cat([values[name] for name in entries], -1)
 
 
 def _as_observed_by(arm: str, entry: Entry) -> Callable[[Any], Tensor]:
@@ -96,27 +116,29 @@ def _object_turn(s: Snapshot) -> Tensor:
 
 
 ARM_ENTRIES: dict[str, Entry] = {
-    "hand_q": Entry(lambda s: s.hand.q, "rad", "hand joint angles, thumb to pinky"),
-    "hand_v": Entry(lambda s: s.hand.v, "rad/s", "hand joint velocities"),
-    "hand_lead": Entry(lambda s: s.hand.target - s.hand.q, "rad", "commanded minus measured hand joints"),
-    "arm_q": Entry(lambda s: s.hand.arm_q, "rad", "arm joint angles"),
-    "tips": Entry(_tips, "m", "fingertip positions in the hand frame"),
-    "tip_axes": Entry(_tip_directions, "1", "fingertip directions (tip z axes), world frame"),
-    "wrist_p": Entry(lambda s: s.hand.wrist_p, "m", "wrist position, world frame"),
-    "wrist_R": Entry(lambda s: _axes(s.hand.wrist_q), "1", "wrist orientation, two columns of its matrix"),
-    "wrist_v": Entry(lambda s: s.hand.wrist_v, "m/s", "wrist linear velocity, world frame"),
-    "wrist_w": Entry(lambda s: s.hand.wrist_w, "rad/s", "wrist angular velocity, world frame"),
+    "hand_q": Entry(lambda s: s.hand.q, "rad", "hand joint angles, thumb to pinky", sensed=True),
+    "hand_v": Entry(lambda s: s.hand.v, "rad/s", "hand joint velocities", sensed=True),
+    "hand_lead": Entry(lambda s: s.hand.target - s.hand.q, "rad", "commanded minus measured hand joints", sensed=True),
+    "arm_q": Entry(lambda s: s.hand.arm_q, "rad", "arm joint angles", sensed=True),
+    "tips": Entry(_tips, "m", "fingertip positions in the hand frame", sensed=True),
+    "tip_axes": Entry(_tip_directions, "1", "fingertip directions (tip z axes), world frame", sensed=True),
+    "wrist_p": Entry(lambda s: s.hand.wrist_p, "m", "wrist position, world frame", sensed=True),
+    "wrist_R": Entry(lambda s: _axes(s.hand.wrist_q), "1", "wrist orientation, two columns of its matrix", sensed=True),
+    "wrist_v": Entry(lambda s: s.hand.wrist_v, "m/s", "wrist linear velocity, world frame", sensed=True),
+    "wrist_w": Entry(lambda s: s.hand.wrist_w, "rad/s", "wrist angular velocity, world frame", sensed=True),
     "object_p": Entry(lambda s: in_wrist(s, s.object.p), "m", "object position in the hand frame"),
     "object_R": Entry(_object_turn, "1", "object orientation in the hand frame, two columns of its matrix"),
     "object_v": Entry(lambda s: turned_in_wrist(s, s.object.v), "m/s", "object velocity in the hand's axes"),
     "object_w": Entry(_object_spin, "rad/s", f"object spin in the hand's axes, clipped at {FASTEST_SPIN:g}"),
     "object_rise": Entry(lambda s: lifted(s)[:, None], "m", "height of the object above its start"),
-    "touch": Entry(lambda s: s.hand.touch.float(), "1", "contact of thumb, index, middle, ring, pinky, palm"),
+    "touch": Entry(
+        lambda s: s.hand.touch.float(), "1", "contact of thumb, index, middle, ring, pinky, palm", sensed=True
+    ),
     "max_penetration": Entry(
         lambda s: s.max_penetration[:, None] * 1000, "mm", "largest overlap of the episode so far"
     ),
     "stage": Entry(lambda s: s.stage[:, None].float(), "1", "index of the active stage"),
-    "time": Entry(lambda s: s.time[:, None], "1", "share of the episode that is over"),
+    "time": Entry(lambda s: s.time[:, None], "1", "share of the episode that is over", sensed=True),
     "goal": Entry(
         lambda s: torch.cat(goal_error(s), -1), "m, rad", "wrist to candidate: position and rotation vector", True
     ),
@@ -127,8 +149,10 @@ ARM_ENTRIES: dict[str, Entry] = {
         "wrist to the next nearest candidates: position and rotation vector of each",
         True,
     ),
-    "phase": Entry(lambda s: s.goal.phase, "1", "phase of the reference", True, True),
-    "residual": Entry(lambda s: s.goal.residual, "1", "low-passed residual action, in units of its bounds", True, True),
+    "phase": Entry(lambda s: s.goal.phase, "1", "phase of the reference", True, True, sensed=True),
+    "residual": Entry(
+        lambda s: s.goal.residual, "1", "low-passed residual action, in units of its bounds", True, True, sensed=True
+    ),
 }
 """What every arm of every task observes."""
 SHARED_ENTRIES = ("max_penetration", "stage", "time")

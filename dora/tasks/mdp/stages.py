@@ -96,3 +96,8 @@ class StageMachine(Generic[S]):
     def finished(self) -> Tensor:
         """(N,) bool: all stages done."""
         return self.index == len(self)
+
+    def report(self) -> dict[str, Tensor]:
+        """(N,) tensors for `info`: whether all stages are done, the active one, and which were completed so far."""
+        done = {f"stage/{stage.name}": self.furthest > k for k, stage in enumerate(self.stages)}
+        return {"finished": self.finished, "stage": self.index.clone(), **done}
