@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import torch
 import trimesh
@@ -33,6 +34,7 @@ from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.report import tables, write_report
 from dora.agents.runs.run_folder import RunFolder
 from dora.agents.runs.run_results import find_runs
+from dora.live.recordings import Recording
 from dora.robot import loading
 from dora.robot.build import write_urdf
 
@@ -222,6 +224,21 @@ def with_ending(function: Callable[[str, Path], object], ending: str) -> Callabl
     return functools.partial(function, ending)
 
 
+def write_recording(folder: Path) -> None:
+    """A trajectory file of one short episode, with its index."""
+    with h5py.File(folder / "recorded.h5", "w") as file:
+        group = file.create_group("traj_0")
+        group["actions"] = np.linspace(-1, 1, 78, dtype=np.float32).reshape(3, 26)
+        group["env_states/actors/cube"] = np.zeros((4, 13), np.float32)
+    info = {"env_id": "dora:DoraCube-v1", "env_kwargs": {"guidance": "none", "preset": "none"}}
+    episodes = [{"episode_id": 0, "episode_seed": 5, "control_mode": "wrist_delta_hand_pos"}]
+    (folder / "recorded.json").write_text(json.dumps({"env_info": info, "episodes": episodes}))
+
+
+def load_recording(folder: Path) -> None:
+    Recording.open(folder / "recorded.h5").episode(0)
+
+
 LOADERS: dict[str, Loader] = {
     "checkpoint": Loader(write_checkpoint, load_checkpoint, sealed=True),
     "replay": Loader(lambda folder: replay_of(20).save(folder, "run"), load_replay, sealed=True),
@@ -234,6 +251,7 @@ LOADERS: dict[str, Loader] = {
     "result.json": Loader(write_result, load_results, ("result.json",)),
     "curve.csv": Loader(write_result, load_results, ("curve.csv",)),
     "progress.csv": Loader(write_result, load_results, ("progress.csv",)),
+    "recording": Loader(write_recording, load_recording),
     "report": Loader(write_result, load_report),
     "robot.toml": Loader(write_robot, load_robot, ("robot.toml",)),
     "robot.urdf": Loader(write_robot, load_robot, ("robot.urdf",)),

@@ -63,13 +63,17 @@ def damaged(path: Path, folder: Path, how: str) -> Path:
         copy.with_suffix(".json").write_text(json.dumps(index) if how != "no json" else "{")
     if how == "text":
         copy.write_text("nothing")
-    elif how in ("no actions", "nan"):
+    elif how in ("no actions", "nan", "link", "words"):
         with h5py.File(copy, "a") as file:
             group: Any = file["traj_0"]
             if how == "nan":
                 group["actions"][3] = np.nan
             else:
                 del group["actions"]
+            if how == "link":
+                group["actions"] = h5py.ExternalLink(str(path), "traj_0/actions")
+            elif how == "words":
+                group["actions"] = ["left", "right"]
     return copy
 
 
@@ -85,6 +89,8 @@ def damaged(path: Path, folder: Path, how: str) -> Path:
         ("text", "has no intact episode traj_0"),
         ("no actions", "has no intact episode traj_0"),
         ("nan", "are no table of finite numbers"),
+        ("link", "actions is missing or is a link"),
+        ("words", "actions is no array of numbers"),
     ],
 )
 def test_a_file_that_is_no_recording_is_refused(recording: Path, tmp_path: Path, how: str, words: str):
@@ -106,3 +112,23 @@ def test_a_damaged_recording_leaves_the_present_player(recording: Path, tmp_path
     assert "are no table of finite numbers" in state.message
     assert watched.steps(2).episode.step == 2
     watched.session.stop()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("guidance", "nothing", "nothing"),
+        ("guidance_parts", 5, "cannot be made|guidance_parts"),
+        ("config", [1], "config"),
+        ("control_mode", "fly", "unknown control mode 'fly'"),
+    ],
+)
+def test_a_recording_of_a_task_that_cannot_be_made_is_refused(
+    recording: Path, tmp_path: Path, name: str, value: Any, words: str
+):
+    copy = damaged(recording, tmp_path, "")
+    index = json.loads(copy.with_suffix(".json").read_text())
+    index["env_info"]["env_kwargs"][name] = value
+    copy.with_suffix(".json").write_text(json.dumps(index))
+    with pytest.raises(InputError, match=words):
+        Watched("DoraCube-v1", [recorded(Recording.open(copy))])

@@ -329,6 +329,14 @@ def test_what_ends_the_thread_is_kept():
     session.stop()
 
 
+def test_an_action_that_is_not_finite_stops_time_and_is_explained():
+    watched = Watched("DoraCube-v1", [Player("broken", {}, lambda o: torch.full((1, 26), torch.nan))], preset="none")
+    state = watched.steps(1)
+    assert (state.running, state.episode.step) == (False, 0)
+    assert "NaN" in state.message
+    watched.session.stop()
+
+
 def test_nobody_who_acts_and_unknown_names_are_refused():
     with pytest.raises(InputError, match="Somebody has to act"):
         Session("DoraCube-v1", [])

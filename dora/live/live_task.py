@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dora.errors import InputError, shown
 from dora.live.players import Player
 from dora.live.reading import EpisodeLog, Reader, read_setup, verdict
 from dora.live.recordings import RecordedEpisode
@@ -88,7 +89,7 @@ class LiveTask:
         """Makes the environment, unless the present one is the same."""
         if self._env is not None and options == self._options:
             return
-        made = make_task(self._env_id, 1, sim_backend="physx_cpu", **options)
+        made = _made(self._env_id, options)
         if self._env is not None:
             self._env.close()
         self._env, self._options = made, options
@@ -179,6 +180,20 @@ class LiveTask:
         if self._env is not None:
             self._env.close()
             self._env = None
+
+
+def _made(env_id: str, options: dict[str, Any]) -> DoraEnv:
+    """The task of one environment.
+
+    Raises:
+        InputError: options, which may come from a file, are of another kind.
+    """
+    try:
+        return make_task(env_id, 1, sim_backend="physx_cpu", **options)
+    except InputError:
+        raise
+    except (TypeError, ValueError, LookupError, AttributeError) as error:
+        raise InputError(f"{env_id} cannot be made with {shown(options)} ({error}): use other options.") from error
 
 
 def _tensors(state: Mapping[str, Any]) -> dict[str, Any]:

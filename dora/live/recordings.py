@@ -17,8 +17,10 @@ from dora.tasks import check_task_id
 
 MOST_BYTES = 4_000_000_000
 """Size of a trajectory file above which it is not read [bytes]."""
-MOST_NUMBERS = 50_000_000
-"""Largest number of values of the actions, or of the states, of one episode."""
+MOST_NUMBERS = 10_000_000
+"""Largest number of values of one array of an episode."""
+MOST_ARRAYS, DEEPEST = 1000, 10
+"""Largest number of arrays in one group of an episode, and depth of groups in each other."""
 MOST_SEED = 2**32 - 1
 """Largest seed."""
 KEPT = ("guidance", "guidance_parts", "hand_joints", "preset", "config", "control_mode", "robot_uids")
@@ -92,9 +94,9 @@ class Recording:
         name, seed = self.names[number]
         try:
             with h5py.File(self.path) as file:
-                group: Any = file[name]
-                actions = np.asarray(_bounded(group["actions"]), np.float32)
-                state = _first(group["env_states"]) if "env_states" in group else None
+                group = _member(file, name)
+                actions = np.asarray(_array(group, "actions"), np.float32)
+                state = _first(_member(group, "env_states"), DEEPEST) if "env_states" in group else None
         except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InputError(f"{self.path} has no intact episode {name} ({reason}): record it again.") from error
@@ -113,15 +115,30 @@ def _named(episode: Any, path: Path) -> tuple[str, int]:
     return f"traj_{number}", seed if type(seed) is int and 0 <= seed <= MOST_SEED else 0
 
 
-def _bounded(data: Any) -> Any:
-    if not isinstance(data, h5py.Dataset) or data.size is None or data.size > MOST_NUMBERS:
-        raise ValueError("too many numbers, or none")
+def _member(group: Any, name: str) -> Any:
+    """A group or array that is in the file itself; ValueError for a link, which may lead to another file."""
+    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+        raise ValueError(f"{name} is missing or is a link")
+    return group[name]
+
+
+def _array(group: Any, name: str) -> Any:
+    """An array of bounded size that is in the file itself; ValueError for another one."""
+    data = _member(group, name)
+    if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external or data.dtype.kind not in "biuf":
+        raise ValueError(f"{name} is no array of numbers in the file itself")
+    if data.size is None or not 0 < data.size <= MOST_NUMBERS or data.ndim < 1:
+        raise ValueError(f"{name} has too many numbers, or none")
     return data
 
 
-def _first(group: Any) -> dict[str, Any]:
-    """The first row of every array of a group, as (1, ...)."""
+def _first(group: Any, depth: int) -> dict[str, Any]:
+    """The first row of every array of a group, as (1, ...); ValueError if it is too deep or too large."""
+    if depth == 0 or not isinstance(group, h5py.Group) or len(group) > MOST_ARRAYS:
+        raise ValueError("its states are too many, or nested too deep")
     return {
-        name: _first(part) if isinstance(part, h5py.Group) else np.asarray(_bounded(part)[:1], np.float32)
-        for name, part in group.items()
+        name: _first(_member(group, name), depth - 1)
+        if isinstance(_member(group, name), h5py.Group)
+        else np.asarray(_array(group, name)[:1], np.float32)
+        for name in group
     }

@@ -138,7 +138,11 @@ class Session:
         return (self._running or self._steps_left > 0) and not self._task.over
 
     def _step(self, now: float) -> None:
-        self._task.step()
+        try:
+            self._task.step()
+        except InputError as error:  # the action does not fit the task, or is not finite
+            self._running, self._steps_left, self._message = False, 0, str(error)
+            return self._publish()
         self._steps_left = max(self._steps_left - 1, 0)
         if self._task.over:
             self._steps_left, self._rest_until = 0, now + REST
