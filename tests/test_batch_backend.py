@@ -147,7 +147,7 @@ def test_works_without_a_vulkan_driver():
         [sys.executable, "-c", NO_DRIVER], env=environment, capture_output=True, text=True, timeout=120
     )
     assert result.returncode == 0, result.stderr
-    assert "refused: obs_mode 'rgb' needs a renderer" in result.stdout
+    assert "refused: obs_mode 'rgb' needs pictures" in result.stdout
 
 
 def test_the_ground_carries_objects_in_every_environment():
