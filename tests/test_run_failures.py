@@ -165,6 +165,20 @@ def test_a_failing_run_is_told_in_one_line_with_the_command_that_resumes(
     assert said.endswith(f"--resume {tmp_path / 'run'}")
 
 
+@pytest.mark.parametrize(
+    ("original", "own", "shown"),
+    [
+        ("/v/bin/python experiments/run.py --env E --seed 1", 4, "python experiments/run.py"),
+        ("/v/bin/python /v/bin/dora run --env E", 2, "dora run"),
+        ("python3 -m dora run --env E", 2, "python -m dora run"),
+        ("python experiments/run.py", 0, "python experiments/run.py"),
+    ],
+)
+def test_the_command_that_resumes_begins_as_the_run_began(original: str, own: int, shown: str):
+    words = original.split()
+    assert " ".join(run_command.started_as(words, ["dora run", *words[len(words) - own :]])) == shown
+
+
 def test_the_last_evaluation_leaves_the_networks_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Also if it is interrupted: what is resumed is the last state, not the best policy with the last critic."""
     folder = RunFolder(tmp_path)

@@ -53,6 +53,8 @@ ENTRANCES = ("--env", "--eval-only", "--checkpoint", "--resume")
 """Options that say what is run."""
 SHOWN = "DoraHammer-v1"
 """Task whose defaults --help shows if --env names none."""
+INSTALLED = ("dora", "run")
+"""How this command is called where the package is installed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +186,7 @@ def train(args: Args) -> tuple[Path, int]:
     with folder.locked():
         folder.write_config(config)
         trainer = Trainer(config, task_maker(config), folder, resume=args.resume is not None, zero=args.zero_correction)
-        go_on = "To go on: " + shlex.join(["python", *sys.argv[:1], "--resume", str(folder.path)])
+        go_on = "To go on: " + shlex.join([*started_as(sys.orig_argv, sys.argv), "--resume", str(folder.path)])
         try:
             trainer.run()
         except RunFailure as error:
@@ -196,6 +198,19 @@ def train(args: Args) -> tuple[Path, int]:
     if args.video and film(folder.best, config, folder.video / "best.mp4"):
         add_film(folder.path, folder.video / "best.mp4", trainer.counters.env_steps)
     return folder.path, 0
+
+
+def started_as(original: Sequence[str], own: Sequence[str]) -> list[str]:
+    """The command line that began this program, without its options.
+
+    Args:
+        original: all words, the interpreter first, as `sys.orig_argv`.
+        own: name and options of the program, as `sys.argv`.
+    """
+    words = list(original[: len(original) - len(own) + 1])
+    if len(words) == len(INSTALLED) + 1 and Path(words[1]).name == INSTALLED[0]:  # python .../bin/dora run
+        return list(INSTALLED)
+    return ["python", *words[1:]]
 
 
 def evaluate_only(args: Args) -> Path:
