@@ -17,6 +17,7 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 import dora.sim
 from dora.errors import InputError
+from dora.sim.batch.rendering import NOTE
 
 
 @pytest.fixture
@@ -148,6 +149,14 @@ def test_works_without_a_vulkan_driver():
     )
     assert result.returncode == 0, result.stderr
     assert "refused: obs_mode 'rgb' needs pictures" in result.stdout
+    assert "svulkan" not in result.stderr
+    assert result.stderr.count(NOTE) == 1
+
+
+def test_the_import_says_nothing():
+    """Not even that SAPIEN takes its own Vulkan loader, where the system has none."""
+    result = subprocess.run([sys.executable, "-c", "import dora"], capture_output=True, text=True, check=True)
+    assert (result.stdout, result.stderr) == ("", "")
 
 
 def test_the_ground_carries_objects_in_every_environment():

@@ -12,6 +12,8 @@ from dora.version import source_commit, version_line
 
 HELP_SECONDS = 0.5
 """Longest time of --help and --version [s]."""
+IMPORT_SECONDS = 0.5
+"""Longest time of `import dora` beyond that of ManiSkill's tasks, of the processor [s]."""
 TRIES = 5
 """Tries of which the quickest counts, so that other work on the machine does not."""
 MODULE = (sys.executable, "-m", "dora")
@@ -82,6 +84,12 @@ def test_a_command_runs_in_any_folder(tmp_path: Path):
     assert done.returncode == 2, done.stderr
     assert "DoraCube-v1" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_the_import_adds_little_to_that_of_maniskill():
+    code = "import mani_skill.envs, time; start = time.process_time(); import dora; print(time.process_time() - start)"
+    assert min(float(run(sys.executable, "-c", code).stdout) for _ in range(TRIES)) < IMPORT_SECONDS
 
 
 @pytest.mark.slow

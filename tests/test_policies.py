@@ -100,8 +100,6 @@ def test_an_observation_that_does_not_fit_is_refused_with_a_remedy(obs: object, 
 def test_wrong_ids_and_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="did you mean DoraCube-v1"):
         dora.load_policy("DoraCub-v1")
-    with pytest.raises(InputError, match="a task id or a path"):
-        dora.load_policy(3)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="checkpoint"):
         dora.load_policy(tmp_path / "policy.safetensors")
 
@@ -124,7 +122,7 @@ def test_a_run_of_ones_own_is_loaded_by_its_path(tmp_path: Path) -> None:
         ({"preset": "hard", "config": {"lift": 0.12}}, None),
         ({"guidance": "none"}, "guidance 'affordance', and the environment has 'none'"),
         ({"guidance": "grasps"}, "has 'grasps'"),
-        ({"guidance_parts": ["prior"]}, "has 'affordance (prior alone)'"),
+        ({"guidance_parts": ["prior"]}, r"has 'affordance \(prior alone\)'"),
         ({"hand_joints": 15}, "control mode"),
         ({"config": {"residual": {"joint": 0.2}}}, r"config\.residual"),
         ({"config": {"optimised": True}}, r"config\.optimised False"),

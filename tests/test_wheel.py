@@ -53,7 +53,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_lines_of_the_readme_are_five() -> None:
-    assert len(five_lines().strip().splitlines()) == 5
+    assert len([line for line in five_lines().splitlines() if line]) == 5
     assert "dora.load_policy" in five_lines()
 
 

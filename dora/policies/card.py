@@ -115,7 +115,8 @@ class Card:
 
     def __str__(self) -> str:
         """The card as a table of two columns."""
-        rows = [["guidance", self.guidance], *map(list, zip(HEADINGS, self.row(), strict=True))]
+        row = [*self.row()[:-1], self.failures_text.replace(", ", "\n")]
+        rows = [["guidance", self.guidance], *map(list, zip(HEADINGS, row, strict=True))]
         stages = ", ".join(f"{name} {100 * rate:.1f} %" for name, rate in self.stage_rates.items())
         training = f"{self.training_success:.2f} of {self.training_episodes} episodes, best of {self.chosen_among} runs"
         rows += [

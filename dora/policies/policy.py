@@ -197,8 +197,6 @@ def load_policy(which: str | Path) -> TaskPolicy:
                 f"train one by dora run --env {env_id} and load its folder."
             )
         return TaskPolicy(read_checkpoint(path), path, Card.read(card) if card.is_file() else None)
-    if not isinstance(which, str | Path):
-        raise InputError(f"load_policy takes a task id or a path, not {shown(which)}.")
     if isinstance(which, str) and not Path(which).exists():
         check_task_id(which)
     path = checkpoint_path(Path(which))
