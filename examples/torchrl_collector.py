@@ -17,7 +17,7 @@ args = parser.parse_args()
 policy = dora.load_policy(args.env)
 env = make(args.env, num_envs=args.num_envs)
 env.set_seed(0)
-steps = env.env.unwrapped.max_steps
+steps = env.env.get_wrapper_attr("max_steps")
 actor = TensorDictModule(policy, in_keys=["observation"], out_keys=["action"])
 frames = steps * args.num_envs
 with torch.no_grad():

@@ -333,7 +333,7 @@ def test_a_film_is_written(tmp_path: Path):
 
 
 def test_tensorboard_shows_a_film_as_moving_pictures(tmp_path: Path):
-    shades = [np.full((32, 48, 3), 20 * k, np.uint8) for k in range(11)]
+    shades: Any = [np.full((32, 48, 3), 20 * k, np.uint8) for k in range(11)]
     imageio.mimwrite(tmp_path / "a.mp4", shades, fps=20, macro_block_size=8)
     add_film(tmp_path, tmp_path / "a.mp4", 70)
     (image,) = events_of(tmp_path).Images(FILM)

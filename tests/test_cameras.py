@@ -141,13 +141,13 @@ def test_pictures_without_state_leave_out_what_is_privileged(cubes: Any):
 def test_what_is_not_privileged_knows_nothing_of_the_objects(env_id: str):
     env = tasks.make_task(env_id, 2, preset="standard", obs_mode="state_dict")
     env.reset(seed=0)
-    before = env.step(env.scripted_action())[0]
+    before: Any = env.step(env.scripted_action())[0]
     for body in env.objects.values():
         pose = body.pose
         body.set_pose(Pose.create_from_pq(pose.p + 0.05, pose.q[:, [1, 0, 3, 2]]))
         body.set_linear_velocity(body.linear_velocity + 0.1)
     env._snapshot = None
-    after = env.get_obs()
+    after: Any = env.get_obs()
     assert before["agent"].keys() == after["agent"].keys() >= {"hand_q", "arm_q", "wrist_p", "touch"}
     for name, value in before["agent"].items():
         assert torch.equal(value, after["agent"][name]), name
@@ -484,7 +484,7 @@ def test_a_window_without_a_display_is_refused_in_one_sentence():
 @drawn
 @pytest.mark.parametrize("env_id", ["DoraCube-v1", STOCK])
 def test_maniskills_wrappers_take_pictures_of_a_batch(env_id: str, tmp_path: Path):
-    env = gym.make(env_id, num_envs=2, sim_backend=BACKEND, obs_mode="rgb+depth", render_mode="all",
+    env: Any = gym.make(env_id, num_envs=2, sim_backend=BACKEND, obs_mode="rgb+depth", render_mode="all",
                    render_backend="cpu", human_render_camera_configs={"width": 64, "height": 64})  # fmt: skip
     recorder = RecordEpisode(env, str(tmp_path), trajectory_name="recorded", max_steps_per_video=3)
     flat = FlattenRGBDObservationWrapper(recorder)

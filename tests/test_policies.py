@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -148,7 +149,7 @@ def test_an_environment_of_another_task_is_refused() -> None:
 
 def test_the_environment_that_a_policy_makes_fits_it() -> None:
     policy = dora.load_policy("DoraCube-v1")
-    env = policy.make(2, sim_backend="physx_cpu_batch")
+    env: Any = policy.make(2, sim_backend="physx_cpu_batch")
     policy.check(env)
     obs, _ = env.reset(seed=[3, 4])
     assert policy(obs).shape == (2, 26)
@@ -160,7 +161,8 @@ def test_the_environment_that_a_policy_makes_fits_it() -> None:
                                     pytest.param("DoraJug-v1", marks=pytest.mark.slow)])  # fmt: skip
 def test_a_policy_succeeds_in_the_environment_of_gym_make(env_id: str) -> None:
     """On starts that no training, evaluation or card uses."""
-    policy, env = dora.load_policy(env_id), gym.make(env_id, num_envs=STARTS, sim_backend="physx_cpu_batch")
+    policy = dora.load_policy(env_id)
+    env: Any = gym.make(env_id, num_envs=STARTS, sim_backend="physx_cpu_batch")
     obs, info = env.reset(seed=[77_000 + k for k in range(STARTS)])
     for _ in range(env.unwrapped.max_steps):  # pyright: ignore[reportAttributeAccessIssue]
         obs, _, _, _, info = env.step(policy(obs))

@@ -140,5 +140,5 @@ def _first(group: Any, depth: int) -> dict[str, Any]:
         name: _first(_member(group, name), depth - 1)
         if isinstance(_member(group, name), h5py.Group)
         else np.asarray(_array(group, name)[:1], np.float32)
-        for name in group
+        for name in map(str, group)
     }
