@@ -19,6 +19,7 @@ from dora.agents.evaluation.evaluate import Evaluation
 from dora.agents.evaluation.intervals import wilson
 from dora.agents.runs.run_results import find_runs
 from dora.errors import InputError
+from dora.policies import bundle
 from dora.policies.bundle import PAGE, cards_table, check_agrees, chosen, is_bundled, make_card
 from dora.policies.card import Card, failure_causes
 from dora.policies.policy import bundled_files, bundled_ids, load_policy
@@ -273,6 +274,24 @@ def test_a_result_that_the_policy_does_not_reach_is_refused() -> None:
     with pytest.raises(InputError, match="dora run --eval-only"):
         check_agrees(episodes(*[{"success": 0.0}] * 50), choice.run)
     check_agrees(episodes(*[{}] * 49, {"success": 0.0}), choice.run)
+
+
+def test_a_further_run_that_is_no_better_only_changes_how_many_there_were(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = bundled_files("DoraCube-v1")
+    copies = tuple(tmp_path / path.name for path in files)
+    for path, copy in zip(files, copies, strict=True):
+        copy.write_bytes(path.read_bytes())
+    monkeypatch.setattr(bundle, "bundled_files", lambda _: copies)
+    choice = chosen(find_runs(RESULTS), "DoraCube-v1")
+    assert choice is not None
+    more = dataclasses.replace(choice, among=choice.among + 1)
+    assert is_bundled(more)
+    bundle.count_runs(more)
+    assert Card.read(copies[1]) == dataclasses.replace(Card.read(files[1]), chosen_among=more.among)
+    copies[0].write_bytes(bundled_files("DoraJug-v1")[0].read_bytes())
+    assert not is_bundled(more), "another policy is no longer bundled"
 
 
 def test_a_card_survives_its_file_and_damage_is_refused(tmp_path: Path) -> None:

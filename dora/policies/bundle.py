@@ -81,6 +81,7 @@ def main() -> int:
                     raise InputError(f"there is no run of {env_id} under {args.results} that a bundle may hold.")
                 continue
             if not args.again and is_bundled(choice):
+                count_runs(choice)
                 print(f"{env_id}: {choice.run.folder} is bundled already (--again makes its card anew).")
                 continue
             print(f"{env_id}: {choice.run.folder}, best of {choice.among}; counting what it fails at ...")
@@ -123,9 +124,17 @@ def is_bundled(choice: Choice) -> bool:
     if not (policy.is_file() and card.is_file()) or policy.read_bytes() != choice.path.read_bytes():
         return False
     known, result = Card.read(card), choice.run.result
-    return (known.success_rate, known.episodes, known.run_commit, known.chosen_among) == (
-        result["success_rate"], result.get("eval_episodes"), result.get("commit"), choice.among
+    return (known.success_rate, known.episodes, known.run_commit) == (
+        result["success_rate"], result.get("eval_episodes"), result.get("commit")
     )  # fmt: skip
+
+
+def count_runs(choice: Choice) -> None:
+    """Bring the number of runs on the card of a bundled policy up to date; it stays the best of more or fewer."""
+    path = bundled_files(choice.run.result["env"])[1]
+    card = Card.read(path)
+    if card.chosen_among != choice.among:
+        replace(card, chosen_among=choice.among).write(path)
 
 
 def bundle(choice: Choice, results: Path, commit: str | None, workers: int = 1) -> Card:
