@@ -72,14 +72,14 @@ class Page:
         until(lambda: self.evaluate(f"!!{find}"))
         self.evaluate(f"{find}.click()")
 
-    def wait_for(self, words: str) -> str:
-        """The text once it has these words."""
-        return until(lambda: text if words in (text := self.text()) else None)
+    def wait_for(self, words: str, patience: float = PATIENCE) -> str:
+        """The text once it has these words, which it has within so many seconds."""
+        return until(lambda: text if words in (text := self.text()) else None, patience)
 
 
-def until(found: Any) -> Any:
-    """The first true value that `found` returns; AssertionError if there is none for `PATIENCE`."""
-    end = time.monotonic() + PATIENCE
+def until(found: Any, patience: float = PATIENCE) -> Any:
+    """The first true value that `found` returns; AssertionError if there is none for so many seconds."""
+    end = time.monotonic() + patience
     while time.monotonic() < end:
         if value := found():
             return value

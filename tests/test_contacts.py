@@ -55,6 +55,26 @@ def test_contacts_of_every_step_add_up(backend, num_envs):
     assert (every.take().impulse == 0).all()  # taken
 
 
+@pytest.mark.parametrize(("backend", "num_envs"), [("physx_cpu", 1), (dora.sim.BACKEND, 2)])
+@pytest.mark.parametrize("every_step", [False, True])
+def test_the_mean_contact_point_of_a_cube_is_below_its_centre(backend: str, num_envs: int, every_step: bool):
+    """From either side, also where the groups are in the other order than the bodies of a contact."""
+    env, monitor = resting_cubes(backend, num_envs)
+    scene = env.unwrapped.scene
+    assert monitor.read().point is None
+    cube, table = [scene.actors["cubeA"]], [scene.actors["table-workspace"]]
+    for groups in ({"cube": cube, "table": table}, {"table": table, "cube": cube}):
+        placed = ContactMonitor(scene, groups, every_step=every_step)
+        placed.keep_points()
+        scene.step()
+        point = placed.take().point
+        assert point is not None
+        assert torch.equal(point, point.transpose(1, 2))
+        assert torch.allclose(point[:, 0, 1, :2], scene.actors["cubeA"].pose.p[:, :2], atol=1e-3)
+        assert torch.allclose(point[:, 0, 1, 2], torch.zeros(num_envs), atol=2e-3)
+        assert (point[:, 0, 0] == 0).all()
+
+
 def test_a_body_in_two_groups_is_refused():
     env, _ = resting_cubes(dora.sim.BACKEND, 1)
     cube = env.unwrapped.scene.actors["cubeA"]

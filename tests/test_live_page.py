@@ -29,6 +29,8 @@ from dora.live.session import Session
 from dora.live.state import Forces
 from dora.live.status import status
 
+EPISODE = 600.0
+"""Longest time of an episode on a busy machine whose browser draws without a GPU [s]."""
 SETTLED = 0.3
 """Time after which the widgets' callbacks have been called [s]."""
 
@@ -268,21 +270,21 @@ def test_a_browser_presses_buttons_and_sees_an_episode_succeed(tmp_path: Path):
     if browser is None:
         pytest.skip("no Chromium is installed: apt-get install chromium")
     play = load_command("play")
-    players = play.find_players(play.Args(env="DoraHammer-v1"))
-    session = Session("DoraHammer-v1", players, preset="none", running=False)
+    players = play.find_players(play.Args(env="DoraCube-v1"))
+    session = Session("DoraCube-v1", players, preset="none", running=False)
     with play.served(session, free_port(), "127.0.0.1") as page, open_page(browser, page.url, tmp_path) as tab:
         tab.wait_for("under way")
         assert until(lambda: tab.evaluate("document.querySelectorAll('canvas').length")) >= 1
         tab.press("Step")
-        tab.wait_for("0.03 s of 8 s")
+        tab.wait_for("0.05 s of 5 s")
         assert session.state.episode.step == 1
         tab.press("Push the object")
         tab.press("Reset")
-        tab.wait_for("0.00 s of 8 s")
+        tab.wait_for("0.00 s of 5 s")
         tab.press("Run")
-        tab.wait_for("success: all stages done")
+        tab.wait_for("success: all stages done", EPISODE)
         assert session.state.episode.success
-        assert page.sent > 30
+        assert page.sent > 10
         tab.press("Pause")
         until(lambda: not session.state.running)
         tab.wait_for("stands still")

@@ -127,8 +127,8 @@ def _array(group: Any, name: str) -> Any:
     data = _member(group, name)
     if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external or data.dtype.kind not in "biuf":
         raise ValueError(f"{name} is no array of numbers in the file itself")
-    if data.size is None or not 0 < data.size <= MOST_NUMBERS or data.ndim < 1:
-        raise ValueError(f"{name} has too many numbers, or none")
+    if data.size is None or data.size > MOST_NUMBERS or data.ndim < 1 or len(data) == 0:
+        raise ValueError(f"{name} has too many numbers, or no rows")
     return data
 
 
