@@ -9,7 +9,10 @@ import torch
 
 torch.set_num_threads(1)
 
-LONG = ("test_tasks.py", "test_agents_train.py", "test_run_failures.py", "test_adding_a_task.py", "test_hammer.py")
+LONG = (
+    "test_tasks.py", "test_agents_train.py", "test_run_failures.py", "test_adding_a_task.py", "test_hammer.py",
+    "test_cameras.py",
+)  # fmt: skip
 """Modules that take longest; they come first, so that no process is left with one of them when the others are done."""
 
 

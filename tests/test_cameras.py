@@ -127,6 +127,14 @@ def test_state_beside_pictures_is_the_state_alone():
         env.close()
 
 
+@pytest.mark.parametrize("env_id", tasks.task_ids())
+def test_the_state_is_the_table_in_its_order(env_id: str):
+    env = tasks.make_task(env_id, 2, preset="standard")
+    state = env.reset(seed=0)[0]
+    assert torch.equal(state, torch.cat([entry.value(env.observed) for entry in env.observation_entries.values()], -1))
+    env.close()
+
+
 @drawn
 def test_pictures_without_state_leave_out_what_is_privileged(cubes: Any):
     cubes.reset(seed=0)

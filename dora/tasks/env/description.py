@@ -11,24 +11,14 @@ Rows = list[list[str]]
 
 
 def observation_rows(env: Any) -> Rows:
-    """Entries of the observation: columns, name, size, unit, meaning, with what they exist, and whether they stay where
-    pictures are observed without state."""
+    """Entries of the observation: columns, name, size, unit, meaning, with what they exist, and which of them stay beside
+    pictures when the state is not observed."""
     s, start = env.observed, 0
     rows = [["index", "entry", "size", "unit", "meaning", "exists", "beside pictures"]]
     for name, entry in env.observation_entries.items():
         size = entry.value(s).shape[-1]
-        who = "prior" if entry.prior else _with(entry)
-        rows.append(
-            [
-                f"{start}-{start + size - 1}",
-                f"`{name}`",
-                str(size),
-                entry.unit,
-                entry.doc,
-                who,
-                "yes" if entry.sensed else "",
-            ]
-        )
+        who, stays = "prior" if entry.prior else _with(entry), "yes" if entry.sensed else ""
+        rows.append([f"{start}-{start + size - 1}", f"`{name}`", str(size), entry.unit, entry.doc, who, stays])
         start += size
     return rows
 
