@@ -11,8 +11,8 @@ Rows = list[list[str]]
 
 
 def observation_rows(env: Any) -> Rows:
-    """Entries of the observation: columns, name, size, unit, meaning, with what they exist, and which of them stay beside
-    pictures when the state is not observed."""
+    """Entries of the observation: columns, name, size, unit, meaning, with what they exist, and which stay beside pictures
+    when the state is not observed."""
     s, start = env.observed, 0
     rows = [["index", "entry", "size", "unit", "meaning", "exists", "beside pictures"]]
     for name, entry in env.observation_entries.items():
