@@ -11,7 +11,7 @@ Rows = list[list[str]]
 
 
 def observation_rows(env: Any) -> Rows:
-    """Entries of the observation: columns, name, size, unit, meaning, with what they exist, and which stay beside pictures
+    """Entries of the observation: columns, name, size, unit, meaning, with what they exist, which stay beside pictures
     when the state is not observed."""
     s, start = env.observed, 0
     rows = [["index", "entry", "size", "unit", "meaning", "exists", "beside pictures"]]
