@@ -96,7 +96,9 @@ def test_meshes_keep_every_double(vertices: np.ndarray, labels: np.ndarray, tmp_
 
 
 @settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(names=st.lists(st.text(st.characters(codec="utf-8"), min_size=1), min_size=2, max_size=2, unique=True))
+@given(
+    names=st.lists(st.text(st.characters(codec="utf-8"), min_size=1, max_size=200), min_size=2, max_size=2, unique=True)
+)
 def test_regions_may_have_any_name(names: list[str], tmp_path: Path):
     folder = tmp_path / "cube"
     write_object_folder(replace(two_regions(), labels=tuple(names), classes=("A", "B"), target=names[1],

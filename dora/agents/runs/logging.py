@@ -115,7 +115,7 @@ class RunLog:
     def add_final(self, result: Mapping[str, Any], step: int) -> None:
         """Write the figures of a finished run's `result.json` that stand beside its settings."""
         for name in FINAL:
-            if result[name] is not None:
+            if result.get(name) is not None:
                 self._writer.add_scalar(f"final/{name}", result[name], step)
         self._add_hyperparameters(2)
 
