@@ -63,11 +63,13 @@ def damaged(path: Path, folder: Path, how: str) -> Path:
         copy.with_suffix(".json").write_text(json.dumps(index) if how != "no json" else "{")
     if how == "text":
         copy.write_text("nothing")
-    elif how in ("no actions", "nan", "link", "words"):
+    elif how in ("no actions", "nan", "link", "words", "state"):
         with h5py.File(copy, "a") as file:
             group: Any = file["traj_0"]
             if how == "nan":
                 group["actions"][3] = np.nan
+            elif how == "state":
+                del group["env_states"]["actors"]["cube"]
             else:
                 del group["actions"]
             if how == "link":
@@ -104,13 +106,16 @@ def test_a_missing_file_is_refused(tmp_path: Path):
         Recording.open(tmp_path / "none.h5")
 
 
-def test_a_damaged_recording_leaves_the_present_player(recording: Path, tmp_path: Path):
-    broken = recorded(Recording.open(damaged(recording, tmp_path, "nan")))
+@pytest.mark.parametrize(("how", "words"), [("nan", "are no table of finite numbers"), ("state", "cube")])
+def test_a_damaged_recording_leaves_the_present_player(recording: Path, tmp_path: Path, how: str, words: str):
+    """Also one whose first state is refused when its task has been made already."""
+    broken = recorded(Recording.open(damaged(recording, tmp_path, how)))
     watched = Watched("DoraCube-v1", [zero_correction({}), broken], preset="none")
     state = watched.do(Play(broken.name))
     assert state.player == ZERO
-    assert "are no table of finite numbers" in state.message
+    assert words in state.message
     assert watched.steps(2).episode.step == 2
+    assert "candidate" in watched.state.setup.terms
     watched.session.stop()
 
 
