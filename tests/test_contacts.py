@@ -9,6 +9,7 @@ import torch
 
 import dora.sim
 from dora.errors import InputError
+from dora.sim.batch.rendering import can_render, replace_materials
 from dora.sim.contacts import ContactMonitor
 
 GRAVITY = 9.81
@@ -16,6 +17,8 @@ GRAVITY = 9.81
 
 
 def resting_cubes(backend: str, num_envs: int):
+    if not can_render():
+        replace_materials()  # as the batch does, which some tests do not make first
     env: Any = gym.make("StackCube-v1", num_envs=num_envs, sim_backend=backend, render_backend="none", obs_mode="none")
     env.reset(seed=0)
     scene = env.unwrapped.scene

@@ -150,6 +150,8 @@ def test_widgets_follow_the_session_without_giving_orders(watched: Watched, page
     assert (panel.seed.value, panel.preset.value) == (5, "hard")
     assert panel.candidate.value == state.setup.candidates[3]
     assert panel.sliders[2].value == pytest.approx(sum((state.setup.numbers[2].low, state.setup.numbers[2].high)) / 2)
+    time.sleep(SETTLED)
+    assert watched.session._orders.empty()
     watched.do(Reset(6))
     page.update()
     time.sleep(SETTLED)

@@ -46,6 +46,19 @@ def test_a_demonstration_of_a_batch_succeeds_again_alone(recording: Path):
     watched.session.stop()
 
 
+def test_an_episode_begins_in_its_recorded_state_whatever_its_seed(recording: Path, tmp_path: Path):
+    copy = damaged(recording, tmp_path, "")
+    index = json.loads(copy.with_suffix(".json").read_text())
+    index["episodes"][0]["episode_seed"] = 99
+    copy.with_suffix(".json").write_text(json.dumps(index))
+    with h5py.File(recording) as file:
+        group: Any = file["traj_0"]
+        pose = np.array(group["env_states"]["actors"]["cube"])[0, :7]
+    watched = Watched("DoraCube-v1", [recorded(Recording.open(copy))])
+    np.testing.assert_allclose(watched.state.objects["cube"], pose, atol=1e-5)
+    watched.session.stop()
+
+
 def damaged(path: Path, folder: Path, how: str) -> Path:
     """A copy of a recording with something wrong."""
     copy = folder / "copy.h5"
