@@ -10,6 +10,7 @@ import torch
 
 import dora.sim
 
+pytestmark = pytest.mark.usefixtures("materials")
 STEPS = 100
 TASKS = (
     "PickCube-v1",

@@ -9,16 +9,14 @@ import torch
 
 import dora.sim
 from dora.errors import InputError
-from dora.sim.batch.rendering import can_render, replace_materials
 from dora.sim.contacts import ContactMonitor
 
+pytestmark = pytest.mark.usefixtures("materials")
 GRAVITY = 9.81
 """m/s^2"""
 
 
 def resting_cubes(backend: str, num_envs: int):
-    if not can_render():
-        replace_materials()  # as the batch does, which some tests do not make first
     env: Any = gym.make("StackCube-v1", num_envs=num_envs, sim_backend=backend, render_backend="none", obs_mode="none")
     env.reset(seed=0)
     scene = env.unwrapped.scene
