@@ -24,9 +24,9 @@ from dora.errors import InputError
 from dora.live.orders import Choose, Randomise, Reset, Run, Start
 from dora.live.page import Page
 from dora.live.panel import NEAREST
-from dora.live.scene_view import HIDDEN, LENGTH, LONGEST, ON_HAND, ON_OBJECT, arrows
+from dora.live.scene_view import HIDDEN, LENGTH, LONGEST, ON_HAND, ON_OBJECT, SceneView, arrows
 from dora.live.session import Session
-from dora.live.state import Forces
+from dora.live.state import Forces, Poses
 from dora.live.status import status
 
 EPISODE = 600.0
@@ -64,19 +64,26 @@ def answered(watched: Watched, page: Page) -> None:
     page.update()
 
 
-def test_everything_is_drawn_where_the_state_says(watched: Watched, page: Page):
-    watched.do(Run(True))
-    state = watched.steps(60)
-    assert page.update()
-    assert not page.update()  # nothing new
-    view = page.view
+def _assert_drawn(view: SceneView, poses: Poses) -> None:
+    """Each body is drawn at its pose."""
     for key, pose in (
-        *((("link", *name), pose) for name, pose in state.links.items()),
-        *((("object", name), pose) for name, pose in state.objects.items()),
-        *((("fixture", name), pose) for name, pose in state.fixtures.items()),
+        *((("link", *name), pose) for name, pose in poses.links.items()),
+        *((("object", name), pose) for name, pose in poses.objects.items()),
+        *((("fixture", name), pose) for name, pose in poses.fixtures.items()),
     ):
         handle = view._bodies[key]
         assert [*handle.position, *handle.wxyz] == pytest.approx(pose.tolist(), abs=1e-6)
+
+
+def test_everything_is_drawn_where_the_state_says(watched: Watched, page: Page):
+    watched.do(Run(True))
+    state = watched.steps(60)
+    view = page.view
+    for poses in (state.passed[0], state):  # the first physics step of the control step, and the last one
+        assert page.update()
+        assert not page.update()  # nothing new
+        _assert_drawn(view, poses)
+        watched.clock.now += state.setup.dt
     ghost = view._ghosts["arm"].frame
     assert [*ghost.position, *ghost.wxyz] == pytest.approx(state.goals["arm"].wrist.tolist(), abs=1e-6)
     assert len(state.forces.pairs) >= 2

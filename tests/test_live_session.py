@@ -1,5 +1,6 @@
 """A live session does what it is asked: seeds, time, players, starts, candidates, pushes; and says how it stands."""
 
+import itertools
 import math
 import time
 from collections.abc import Iterator
@@ -67,6 +68,26 @@ def test_an_episode_walks_all_stages_succeeds_and_is_followed_by_the_next(cube: 
     state = cube.rest()
     assert (state.episode.seed, state.episode.step) == (1, 0)
     assert len(state.episode.history.time) == 0
+
+
+def test_a_control_step_is_shown_physics_step_by_physics_step(cube: Watched):
+    before = cube.steps(8)
+    state = cube.steps(1)
+    assert len(state.passed) == round(cube.env.sim_freq / cube.env.control_freq) - 1 == 4
+    step = state.setup.dt / (len(state.passed) + 1)
+    times = state.at + step * (np.arange(7) + 0.5)
+    indices, poses = zip(*(state.poses_at(time) for time in times), strict=True)
+    assert indices == (0, 1, 2, 3, 4, 4, 4)
+    assert poses[4] is state
+    arm = next(iter(state.setup.robots))
+    wrist = [moment.links[arm, state.setup.robots[arm].wrist_link] for moment in (before, *poses[:5])]
+    ways = [float(np.linalg.norm(after[:3] - earlier[:3])) for earlier, after in itertools.pairwise(wrist)]
+    assert min(ways) > 1e-4  # it moves in each
+    assert np.linalg.norm(wrist[-1][:3] - wrist[0][:3]) == pytest.approx(sum(ways), rel=0.05)  # and does not jump
+    cube.do(Speed(0.1))
+    slow = cube.steps(1)
+    assert slow.poses_at(slow.at + 10.5 * step)[0] == 1
+    assert cube.do(Reset()).passed == ()  # nothing leads to a new start
 
 
 def test_without_repetition_nothing_follows_an_episode(cube: Watched):

@@ -13,10 +13,11 @@ from dora.errors import InputError, shown
 from dora.live.players import Player
 from dora.live.reading import EpisodeLog, Reader, read_setup, verdict
 from dora.live.recordings import RecordedEpisode
-from dora.live.state import Episode, Setup
+from dora.live.state import Episode, Poses, Setup
 from dora.sim.batch.resets import START
 from dora.tasks import make_task
 from dora.tasks.env.env import DoraEnv
+from dora.tasks.env.scene import TaskScene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +49,7 @@ class LiveTask:
     Attributes:
         setup: of the environment.
         reader: of its bodies.
+        passed: poses after the physics steps of the last control step, but for the last of them.
         over: the episode has ended, by failure or by time.
 
     Raises:
@@ -59,6 +61,9 @@ class LiveTask:
         self._env: DoraEnv | None = None
         self._options: dict[str, Any] = {}
         self.setup: Setup
+        self.reader: Reader
+        self._read: TaskScene | None = None
+        self.passed: tuple[Poses, ...] = ()
         self.begin(beginning)
 
     @property
@@ -81,7 +86,9 @@ class LiveTask:
         self.beginning, self._recorded, env = beginning, recorded, self.env
         env.chosen_start, env.narrow = self._placed, None if beginning.candidate is None else self._only
         self._observation = self._first_observation(recorded)
-        self.reader, self._log, self._info = Reader(env), EpisodeLog(self.setup), env.evaluate()
+        if self._read is not env.task_scene:
+            self.reader, self._read = Reader(env), env.task_scene
+        self._log, self._info = EpisodeLog(self.setup), env.evaluate()
         self._steps, self._reward, self.over = 0, 0.0, False
         self._reachable, self._shares = self._within_reach(), beginning.shares or self._shares_now()
 
@@ -135,8 +142,11 @@ class LiveTask:
 
     def step(self) -> None:
         """Does a control step."""
+        action = self._action()
+        self.reader.passed()  # those of a reset
         with torch.no_grad():
-            self._observation, reward, _, _, self._info = self.env.step(self._action())
+            self._observation, reward, _, _, self._info = self.env.step(action)
+        self.passed = self.reader.passed()[:-1]
         self._steps, self._reward = self._steps + 1, float(reward[0])
         self._log.add(self._steps * self.setup.dt, self._info)
         length = self.setup.max_steps if self._recorded is None else len(self._recorded.actions)

@@ -16,7 +16,7 @@ from dora.live.session import Session
 from dora.live.status import status
 
 UPDATES = 30.0
-"""States that are sent in a second, if there are so many [Hz]."""
+"""Updates that are sent in a second while something moves [Hz]; each shows the poses after another physics step."""
 WORDS, CURVES = 0.1, 0.25
 """Time between updates of words and widgets, and of plots [s]."""
 NEARER = 0.75
@@ -37,7 +37,7 @@ class Page:
 
     Attributes:
         server: viser's server.
-        sent: states that were sent so far.
+        sent: updates that were sent so far.
 
     Raises:
         InputError: viser is not installed, or the port is in use.
@@ -62,7 +62,7 @@ class Page:
         gui.main_panel.dock_right()
         side.dock_left()
         side.set_width(WIDTH)
-        self._shown, self._words_due, self._curves_due = -1, 0.0, 0.0
+        self._shown, self._words_due, self._curves_due = (-1, 0), 0.0, 0.0
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self.error: BaseException | None = None
@@ -95,12 +95,13 @@ class Page:
         return address(self.server)
 
     def update(self) -> bool:
-        """Shows the newest state, unless it is shown already; returns whether it was sent."""
+        """Shows the newest state, on the way to it its physics steps, unless that is shown already; whether it was."""
         state, now = self.session.state, time.monotonic()
-        if state.count == self._shown:
+        index, poses = state.poses_at(self.session.clock())
+        if (state.count, index) == self._shown:
             return False
         with self.server.atomic():
-            self.view.update(state)
+            self.view.update(state, poses)
         if state.setup is not self._setup:
             self.plots.remove()
             self._plot(state.setup)
@@ -112,7 +113,7 @@ class Page:
         if fresh or now >= self._curves_due:
             self.plots.update(state.episode)
             self._curves_due = now + CURVES
-        self._shown, self.sent = state.count, self.sent + 1
+        self._shown, self.sent = (state.count, index), self.sent + 1
         return True
 
     def start(self) -> None:

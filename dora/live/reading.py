@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from dora.live.state import Forces, Goal, History, Setup
+from dora.live.state import Forces, Goal, History, Poses, Setup
+from dora.sim.substeps import watch_physics
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.mdp.memory import MM
 
@@ -47,10 +48,14 @@ def _words(index: int, grasp_class: str, score: float) -> str:
 
 
 class Reader:
-    """Reads the bodies of a built scene; make a new one after a reset with a seed, which builds it anew.
+    """Reads the bodies of a built scene; make a new one when it is built anew.
 
     Args:
         env: of one environment.
+
+    Attributes:
+        scene: that is read.
+        scales: sizes of the objects relative to their nominal ones.
     """
 
     def __init__(self, env: DoraEnv):
@@ -62,11 +67,19 @@ class Reader:
         self.scales = dict(zip(env.objects, env.scale[0].tolist(), strict=True))
         step = env.control_freq if env.task.CONTACT_EVERY_STEP else env.sim_freq
         self._frequency = float(step)
+        self._passed: list[Poses] = []
+        watch_physics(env.scene, lambda _: self._passed.append(Poses(**self.poses())))
 
     def poses(self) -> dict[str, dict[Any, Float[np.ndarray, " 7"]]]:
         """World poses of links, objects and fixtures."""
         groups = {"links": self._links, "objects": self._objects, "fixtures": self._fixtures}
         return {name: {key: _pose(body) for key, body in bodies.items()} for name, bodies in groups.items()}
+
+    def passed(self) -> tuple[Poses, ...]:
+        """Poses after each physics step since this was last called."""
+        passed = tuple(self._passed)
+        self._passed.clear()
+        return passed
 
     def goals(self) -> dict[str, Goal]:
         """What the chosen candidates ask for at the true poses of the objects."""

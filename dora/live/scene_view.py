@@ -15,7 +15,7 @@ from dora.affordance.objects.catalogue import load_object
 from dora.affordance.objects.solids import shape_mesh
 from dora.affordance.views.hands import Hands
 from dora.affordance.views.surface import Surface, unshared
-from dora.live.state import Forces, Goal, LiveState, Setup
+from dora.live.state import Forces, Goal, LiveState, Poses, Setup
 from dora.sim.shapes import DrawnShape
 
 GHOST = ((0, 130, 60), 0.45)
@@ -68,13 +68,13 @@ class SceneView:
     def _add(self, key: Hashable, name: str, mesh: trimesh.Trimesh) -> None:
         self._bodies[key] = self._scene.add_mesh_trimesh(name, mesh)
 
-    def update(self, state: LiveState) -> None:
-        """Moves everything to where it is in this state."""
-        for (arm, link), pose in state.links.items():
+    def update(self, state: LiveState, poses: Poses) -> None:
+        """Shows a state, with the bodies at other poses: those of a physics step on the way to it."""
+        for (arm, link), pose in poses.links.items():
             self._move(("link", arm, link), pose)
-        for name, pose in state.fixtures.items():
+        for name, pose in poses.fixtures.items():
             self._move(("fixture", name), pose)
-        for name, pose in state.objects.items():
+        for name, pose in poses.objects.items():
             self._move(("object", name), pose)
             for handle in (self._maps[name], self._plain[name]):
                 if handle.scale != state.scales[name]:

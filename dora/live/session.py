@@ -16,7 +16,7 @@ from dora.errors import InputError
 from dora.live.live_task import Beginning, LiveTask
 from dora.live.orders import Choose, Order, Play, Push, Randomise, Repeat, Reset, Run, Speed, Start, Step
 from dora.live.players import Player
-from dora.live.state import LiveState
+from dora.live.state import LiveState, Poses
 from dora.tasks.mdp.randomisation import find_preset
 
 REST = 1.0
@@ -53,6 +53,7 @@ class Session:
 
     Attributes:
         players: by their names.
+        clock: gives the time [s].
         state: the newest state.
         error: what ended the thread, if anything did.
 
@@ -75,7 +76,7 @@ class Session:
         find_preset(preset)
         self.players = {player.name: player for player in players}
         self.error: BaseException | None = None
-        self._clock, self._running, self._speed, self._repeat, self._message = clock, running, 1.0, True, ""
+        self.clock, self._running, self._speed, self._repeat, self._message = clock, running, 1.0, True, ""
         self._orders: queue.SimpleQueue[Order] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         self._ending = threading.Event()
@@ -122,9 +123,9 @@ class Session:
         Returns:
             Whether a control step was done.
         """
-        pause = min(max(self._due - self._clock(), 0.0), IDLE) if self._moving else IDLE
+        pause = min(max(self._due - self.clock(), 0.0), IDLE) if self._moving else IDLE
         self._obey(pause if wait else 0.0)
-        now = self._clock()
+        now = self.clock()
         if self._moving and now >= self._due:
             self._step(now)
             return True
@@ -151,7 +152,7 @@ class Session:
         if self._last is not None and now > self._last:
             self._rate += SMOOTH * (dt / (now - self._last) - self._rate)
         self._last, self._due = now, max(self._due + dt / self._speed, now - LATEST)
-        self._publish()
+        self._publish(self._task.passed)
 
     def _go_on(self) -> None:
         """Begins the next episode. A start that was chosen by hand stays, and so does a candidate."""
@@ -164,7 +165,7 @@ class Session:
 
     def _begin(self, beginning: Beginning) -> None:
         self._task.begin(beginning)
-        self._due, self._last = self._clock(), None
+        self._due, self._last = self.clock(), None
 
     # ------------------------------------------------------------------- orders
 
@@ -196,14 +197,14 @@ class Session:
 
     def _run(self, order: Run) -> None:
         self._running, self._steps_left, self._rest_until = order.running, 0, 0.0
-        self._due, self._last = self._clock(), None
+        self._due, self._last = self.clock(), None
 
     def _do_steps(self, order: Step) -> None:
-        self._running, self._steps_left, self._due = False, min(max(order.count, 0), MOST_STEPS), self._clock()
+        self._running, self._steps_left, self._due = False, min(max(order.count, 0), MOST_STEPS), self.clock()
 
     def _set_speed(self, order: Speed) -> None:
         self._speed = min(max(order.speed, SLOWEST), FASTEST)
-        self._due = self._clock()
+        self._due = self.clock()
 
     def _set_repeat(self, order: Repeat) -> None:
         self._repeat = order.repeat
@@ -251,11 +252,13 @@ class Session:
 
     # -------------------------------------------------------------------- state
 
-    def _publish(self) -> None:
-        """Makes the newest state."""
+    def _publish(self, passed: tuple[Poses, ...] = ()) -> None:
+        """Makes the newest state, which came about through these poses."""
         task, self._count = self._task, self._count + 1
         self.state = LiveState(
             count=self._count,
+            at=self.clock(),
+            passed=passed,
             setup=task.setup,
             **task.reader.poses(),
             scales=task.reader.scales,

@@ -120,14 +120,28 @@ class Episode:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LiveState:
-    """A session at one moment.
+class Poses:
+    """Where everything is after a physics step.
 
     Attributes:
-        count: number of states so far; a page that has shown this one need not show it again.
-        setup: of the environment.
         links: world pose of each link by arm and name (7,) [m, wxyz].
         objects, fixtures: the same of objects and of other bodies that are drawn.
+    """
+
+    links: Mapping[tuple[str, str], Float[np.ndarray, " 7"]]
+    objects: Mapping[str, Float[np.ndarray, " 7"]]
+    fixtures: Mapping[str, Float[np.ndarray, " 7"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveState(Poses):
+    """A session after a control step, or after an order.
+
+    Attributes:
+        count: number of states so far.
+        at: when it was made [s], by the clock of the session.
+        passed: poses after the earlier physics steps of the control step that led here; none after an order.
+        setup: of the environment.
         scales: sizes of the objects relative to their nominal ones.
         goals: by arm.
         forces: of the contacts.
@@ -144,10 +158,9 @@ class LiveState:
     """
 
     count: int
+    at: float
+    passed: tuple[Poses, ...]
     setup: Setup
-    links: Mapping[tuple[str, str], Float[np.ndarray, " 7"]]
-    objects: Mapping[str, Float[np.ndarray, " 7"]]
-    fixtures: Mapping[str, Float[np.ndarray, " 7"]]
     scales: Mapping[str, float]
     goals: Mapping[str, Goal]
     forces: Forces
@@ -162,3 +175,16 @@ class LiveState:
     episodes: int
     successes: int
     message: str
+
+    def poses_at(self, time: float) -> tuple[int, Poses]:
+        """The physics step that is to be shown at a time, so that a control step takes as long as its successor needs.
+
+        Args:
+            time: by the clock of the session [s].
+
+        Returns:
+            Its index in the control step, and its poses; after the last one the state itself.
+        """
+        share = (time - self.at) * self.speed / self.setup.dt
+        index = min(max(int(share * (len(self.passed) + 1)), 0), len(self.passed))
+        return index, (*self.passed, self)[index]
