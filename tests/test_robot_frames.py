@@ -19,6 +19,7 @@ from dora.geometry.rotations import (
     rotation_angle,
     rotation_vector_from_quaternion,
 )
+from dora.sim.substeps import watch_contacts
 
 BACKENDS = {"physx_cpu": 1, "physx_cpu_batch": 3}
 """Number of environments on each back end."""
@@ -84,6 +85,65 @@ def test_two_equal_robots_share_a_scene(backend):
     obs = env.step(env.action_space.sample())[0]
     assert obs.isfinite().all()
     env.close()
+
+
+class Twins(TwoHands):
+    """A robot and its twin in the same place."""
+
+    PLACES = (BASE, BASE)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_every_link_of_a_robot_touches_the_same_link_of_another_one(backend):
+    env = scene(Twins, backend, ("diana7_hit", "diana7_hit"))
+    env.reset(seed=0)
+    one, other = (agent.robot.links_map for agent in env.agent.agents_dict.values())
+    shaped = {name for name in env.agent.agents[0].description.shapes if name != "base_link"}  # bases stand fast
+    assert len(shaped) == 23
+    twins = {body.entity: name for links in (one, other) for name in shaped for body in links[name]._bodies}
+    met = set()
+
+    def watch(environment: int, contacts: list) -> None:
+        met.update(
+            (environment, name)
+            for first, second in (contact.bodies for contact in contacts)
+            if first.entity is not second.entity and (name := twins.get(first.entity)) == twins.get(second.entity)
+        )
+
+    watch_contacts(env.scene, watch)
+    env.step(None)
+    assert met == {(environment, name) for environment in range(BACKENDS[backend]) for name in shaped}
+    env.close()
+
+
+class LeftAndRight(TwoHands):
+    """A right and a left robot side by side, near enough to meet."""
+
+    PLACES = (sapien.Pose([0.0, -0.2, 0.0]), sapien.Pose([0.0, 0.2, 0.0]))
+
+
+def test_a_right_and_a_left_robot_move_in_a_batch_as_alone():
+    """Bit for bit, contacts between the two robots included."""
+    generator, states, forces = torch.Generator().manual_seed(0), {}, {}
+    actions = torch.rand(20, BACKENDS["physx_cpu_batch"], 2, 26, generator=generator) * 2 - 1
+    actions[..., 0, 1], actions[..., 1, 1] = 1.0, -1.0  # towards each other
+    for backend, rows in (("physx_cpu_batch", [slice(None)]), ("physx_cpu", [slice(k, k + 1) for k in range(3)])):
+        env = scene(LeftAndRight, backend, ("diana7_hit", "diana7_hit_left"))
+        arms, found, pressed = list(env.agent.agents_dict), [], torch.zeros(())
+        hand = [name for name in env.agent.agents[0].robot_link_names if name.startswith("Right")]
+        for row in rows:
+            env.reset(seed=0, options={"reconfigure": True})  # a scene that remembers no contacts
+            hands = env.agent.agents[0].robot
+            for action in actions[:, row]:
+                env.step({arm: action[:, k] for k, arm in enumerate(arms)})
+                pressed = pressed.maximum(hands.get_net_contact_forces(hand).norm(dim=-1).max())
+            found.append(torch.cat([agent.robot.get_state() for agent in env.agent.agents], -1))
+        states[backend], forces[backend] = torch.cat(found), float(pressed)
+        env.close()
+    assert states["physx_cpu"].isfinite().all()
+    assert forces["physx_cpu"] == forces["physx_cpu_batch"] > 1
+    assert torch.equal(states["physx_cpu_batch"], states["physx_cpu"])
+    assert not torch.equal(states["physx_cpu"][0], states["physx_cpu"][1])
 
 
 def test_a_robot_built_separately_in_every_environment_is_the_same():

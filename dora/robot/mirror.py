@@ -1,0 +1,181 @@
+"""Make the mirror image of a robot folder: `python -m dora.robot.mirror robots/diana7_hit robots/diana7_hit_left`.
+
+The image is that in the plane y = 0 of the base. With S = diag(1, -1, 1) in the frame of every link, a transform T
+becomes S T S: a point (x, y, z) becomes (x, -y, z), the angles (roll, pitch, yaw) become (-roll, pitch, -yaw), the axis
+of a joint, which is a pseudovector, becomes (-x, y, -z), and the products of inertia with y change their sign. Joint
+angles keep their meaning, so limits, gains and postures stay as they are: with the same angles every frame of the image
+is S T S of the original's. "Right" and "left" are exchanged in names.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import tomli_w
+import trimesh
+
+from dora.errors import InputError
+from dora.files import make_folder, write_bytes
+from dora.reading import read_toml
+from dora.robot.loading import ROBOT_FILE, load_robot
+
+POINT, ANGLES, AXIS = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)
+"""What the components of a point, of roll, pitch and yaw, and of an axis of rotation are multiplied by."""
+PRODUCTS = ("ixy", "iyz")
+"""Elements of an inertia tensor that change their sign."""
+SIDES = {"Right": "Left", "Left": "Right", "right": "left", "left": "right", "RIGHT": "LEFT", "LEFT": "RIGHT"}
+"""Words in names that are exchanged."""
+HEADER = "Generated from robots/{name} by `python -m dora.robot.mirror`: edit that, not this."
+"""First comment of the generated files."""
+SOURCE = """# Where this comes from
+
+The mirror image of [{name}](../{name}/SOURCE.md) in the plane y = 0 of its base, made by
+
+    python -m dora.robot.mirror robots/{name} robots/{image}
+
+Joint angles, limits, gains and postures are those of the original; frames, axes, inertias, shapes and meshes are
+mirrored.
+"""
+"""Content of the image's SOURCE.md."""
+
+
+def mirrored_name(text: str) -> str:
+    """A name of the image: "Right_Thumb_0" becomes "Left_Thumb_0", and the other way round."""
+    return re.sub("|".join(SIDES), lambda found: SIDES[found[0]], text)
+
+
+def mirrored_urdf(text: str, name: str, source: str) -> str:
+    """URDF of the image.
+
+    Args:
+        text: of the original.
+        name: of the image.
+        source: name of the original, for the first comment.
+
+    Raises:
+        InputError: a number cannot be read, or a mesh lies outside the folder.
+    """
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        raise InputError(f"the URDF of {source!r} is no XML ({error}); correct it.") from error
+    for element in root.iter():
+        for key, value in element.attrib.items():
+            if key in ("name", "link", "joint", "filename"):
+                element.set(key, mirrored_name(value))
+        if element.tag in ("origin", "axis", "inertia"):
+            _mirror(element, source)
+        if element.tag == "mesh" and (":" in element.get("filename", "") or ".." in element.get("filename", "")):
+            raise InputError(
+                f"the mesh {element.get('filename')} lies outside the folder of {source!r}; move it there."
+            )
+    root.set("name", name)
+    ET.indent(root)
+    body = ET.tostring(root, encoding="unicode")
+    return f'<?xml version="1.0"?>\n<!-- {HEADER.format(name=source)} -->\n{body}\n'
+
+
+def _mirror(element: ET.Element, source: str) -> None:
+    """Mirrors the numbers of an origin, an axis or an inertia."""
+    try:
+        if element.tag == "inertia":
+            for key in PRODUCTS:
+                element.set(key, _number(-float(element.get(key, "0"))))
+        for key, factors in (("xyz", AXIS if element.tag == "axis" else POINT), ("rpy", ANGLES)):
+            if key in element.attrib:
+                values = zip(element.attrib[key].split(), factors, strict=True)
+                element.set(key, " ".join(_number(float(value) * factor) for value, factor in values))
+    except ValueError as error:
+        raise InputError(f"the URDF of {source!r} has an <{element.tag}> that cannot be read ({error}).") from error
+
+
+def _number(value: float) -> str:
+    """A number with 12 digits, never a negative zero."""
+    return f"{value + 0.0:.12g}"
+
+
+def mirrored_table(table: dict[str, Any], name: str) -> dict[str, Any]:
+    """`robot.toml` of the image: other names, and the contact points of the fingers' pads mirrored."""
+    image = _renamed(table, mirrored_name)
+    image["name"] = name
+    for finger, row in image["fingers"].items():
+        try:
+            row["pad"] = [float(value) * factor + 0.0 for value, factor in zip(row["pad"], POINT, strict=True)]
+        except (TypeError, ValueError) as error:
+            raise InputError(f"the pad of the finger {finger!r} has to be three numbers [m].") from error
+    return image
+
+
+def _renamed(value: Any, rename: Callable[[str], str]) -> Any:
+    """A table with other names, as keys and as values."""
+    if isinstance(value, dict):
+        return {rename(key): _renamed(part, rename) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_renamed(part, rename) for part in value]
+    return rename(value) if isinstance(value, str) else value
+
+
+def mirrored_mesh(scene: trimesh.Scene) -> trimesh.Scene:
+    """Image of a mesh, with the transforms of its nodes in its vertices; its faces stay turned outwards."""
+    image = trimesh.Scene()
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph.get(node)
+        part = scene.geometry[name].copy()
+        part.apply_transform(np.diag([*POINT, 1.0]) @ transform)
+        image.add_geometry(part, node_name=str(node), geom_name=str(name))
+    return image
+
+
+def write_mirrored(source: Path, target: Path) -> list[Path]:
+    """Write the image of a robot folder; its name is that of the new folder.
+
+    Args:
+        source: folder with `robot.toml`, a URDF and meshes.
+        target: folder of the image; files that are there already are replaced.
+
+    Returns:
+        The written files.
+
+    Raises:
+        InputError: the robot cannot be read, or the folder cannot be written.
+    """
+    robot = load_robot(source)
+    if target.resolve() == source.resolve():
+        raise InputError(f"{target} is the robot itself; give the folder of its image another name.")
+    make_folder(target / "meshes")
+    written: dict[Path, bytes] = {}
+    urdf = mirrored_urdf(robot.urdf.read_text(), target.name, robot.name)
+    written[target / mirrored_name(robot.urdf.name)] = urdf.encode()
+    table = mirrored_table(read_toml(source / ROBOT_FILE, "robot"), target.name)
+    written[target / ROBOT_FILE] = f"# {HEADER.format(name=robot.name)}\n{tomli_w.dumps(table)}".encode()
+    written[target / "SOURCE.md"] = SOURCE.format(name=robot.name, image=target.name).encode()
+    for mesh in sorted(robot.folder.glob("meshes/*.glb")):
+        scene = mirrored_mesh(trimesh.load_scene(mesh))
+        written[target / "meshes" / mirrored_name(mesh.name)] = cast(
+            bytes, scene.export(file_type="glb", include_normals=True)
+        )
+    for path, content in written.items():
+        write_bytes(path, content)
+    return list(written)
+
+
+def main() -> None:
+    """Write the image of the first folder that is named on the command line into the second one."""
+    if len(sys.argv) != 3:
+        raise SystemExit("usage: python -m dora.robot.mirror FOLDER FOLDER_OF_THE_IMAGE")
+    try:
+        for path in write_mirrored(Path(sys.argv[1]), Path(sys.argv[2])):
+            print(path, path.stat().st_size)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        raise SystemExit(2) from error
+
+
+if __name__ == "__main__":
+    main()

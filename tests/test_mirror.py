@@ -1,0 +1,129 @@
+"""The mirror image of a robot: what is committed is what the command writes, and it is the image of the original."""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from dora.errors import InputError
+from dora.robot import RobotDescription, load_robot
+from dora.robot.kinematics import SerialChain
+from dora.robot.mirror import mirrored_name, mirrored_urdf, write_mirrored
+
+REFLECTION = np.diag([1.0, -1.0, 1.0])
+"""The plane y = 0."""
+POSTURES = 500
+"""Number of random postures."""
+
+
+@pytest.fixture(scope="module")
+def right() -> RobotDescription:
+    return load_robot("diana7_hit")
+
+
+@pytest.fixture(scope="module")
+def left() -> RobotDescription:
+    return load_robot("diana7_hit_left")
+
+
+def test_what_is_committed_is_what_the_command_writes(right: RobotDescription, left: RobotDescription, tmp_path: Path):
+    written = write_mirrored(right.folder, tmp_path / left.name)
+    committed = {path.relative_to(left.folder) for path in left.folder.rglob("*") if path.is_file()}
+    assert {path.relative_to(tmp_path / left.name) for path in written} == committed
+    for path in written:
+        other = left.folder / path.relative_to(tmp_path / left.name)
+        if path.suffix == ".glb":
+            _assert_same_mesh(trimesh.load_scene(path), trimesh.load_scene(other), np.eye(3))
+        else:
+            assert path.read_bytes() == other.read_bytes()
+
+
+def test_every_frame_is_the_image_of_the_original(right: RobotDescription, left: RobotDescription):
+    generator, reflection = torch.Generator().manual_seed(0), torch.from_numpy(REFLECTION)
+    for one, other in zip(right.fingers.values(), left.fingers.values(), strict=True):
+        chains = [SerialChain.of(r, f.tip, dtype=torch.float64) for r, f in ((right, one), (left, other))]
+        assert torch.equal(chains[0].lower, chains[1].lower)
+        assert torch.equal(chains[0].upper, chains[1].upper)
+        share = torch.rand(POSTURES, len(chains[0].lower), generator=generator, dtype=torch.float64)
+        joints = chains[0].lower + (chains[0].upper - chains[0].lower) * share
+        (p, matrix), (image_p, image_matrix) = (chain.tip_pose(joints) for chain in chains)
+        torch.testing.assert_close(image_p, p @ reflection, rtol=0, atol=1e-9)
+        torch.testing.assert_close(image_matrix, reflection @ matrix @ reflection, rtol=0, atol=1e-9)
+
+
+def test_shapes_pads_and_inertias_are_images(right: RobotDescription, left: RobotDescription):
+    for name, shapes in right.shapes.items():
+        for shape, image in zip(shapes, left.shapes[mirrored_name(name)], strict=True):
+            assert image.kind == shape.kind
+            np.testing.assert_allclose(image.size, shape.size, atol=1e-12)
+            np.testing.assert_allclose(image.position, REFLECTION @ shape.position, atol=1e-9)
+            w, x, y, z = shape.quaternion  # S R S, of the same shape up to a half turn of the body about its own axis
+            assert abs(np.dot(image.quaternion, [w, -x, y, -z])) == pytest.approx(1, abs=1e-9)
+    for one, other in zip(right.fingers.values(), left.fingers.values(), strict=True):
+        np.testing.assert_allclose(other.pad, REFLECTION @ one.pad, atol=1e-12)
+    assert left.ignored_pairs == {tuple(sorted(map(mirrored_name, pair))) for pair in right.ignored_pairs}
+    for posture, image in zip(right.postures.values(), left.postures.values(), strict=True):
+        np.testing.assert_array_equal(posture.arm, image.arm)
+        np.testing.assert_array_equal(posture.hand, image.hand)
+
+
+def test_an_inertia_is_an_image():
+    inertia = '<inertia ixx="3" ixy="0.1" ixz="0.2" iyy="4" iyz="0.3" izz="5"/>'
+    text = f'<robot name="a"><link name="Right_l"><inertial>{inertia}</inertial></link></robot>'
+    image = mirrored_urdf(text, "b", "a")
+    tensor = np.array([[3, 0.1, 0.2], [0.1, 4, 0.3], [0.2, 0.3, 5]])
+    ixx, ixy, ixz, iyy, iyz, izz = (float(image.split(f'{key}="')[1].split('"')[0]) for key in
+                                    ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))  # fmt: skip
+    np.testing.assert_allclose(
+        [[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]], REFLECTION @ tensor @ REFLECTION, atol=1e-12
+    )
+    assert '<link name="Left_l">' in image
+    assert '<robot name="b">' in image
+
+
+def test_meshes_are_images_turned_outwards(right: RobotDescription, left: RobotDescription):
+    for path in sorted(right.folder.glob("meshes/*.glb")):
+        image = trimesh.load_scene(left.folder / "meshes" / path.name)
+        _assert_same_mesh(trimesh.load_scene(path), image, REFLECTION)
+
+
+def _assert_same_mesh(scene: trimesh.Scene, image: trimesh.Scene, change: np.ndarray) -> None:
+    """The second scene is the first one after a linear map: vertices, normals, volume, colours, transforms."""
+    assert set(scene.geometry) == set(image.geometry)
+    for name, mesh in scene.geometry.items():
+        other = image.geometry[name]
+        np.testing.assert_allclose(other.vertices, mesh.vertices @ change, atol=1e-6)
+        np.testing.assert_allclose(other.vertex_normals, mesh.vertex_normals @ change, atol=1e-4)
+        assert other.volume == pytest.approx(mesh.volume, rel=1e-4)
+        np.testing.assert_array_equal(other.visual.material.baseColorFactor, mesh.visual.material.baseColorFactor)
+    for node in image.graph.nodes_geometry:
+        np.testing.assert_array_equal(image.graph.get(node)[0], np.eye(4))
+
+
+def test_the_image_of_the_image_is_the_original(right: RobotDescription, tmp_path: Path):
+    write_mirrored(load_robot("diana7_hit_left").folder, tmp_path / "again")
+    again = load_robot(tmp_path / "again")
+    assert again.hand.names == right.hand.names
+    table, original = (tomllib.loads((r.folder / "robot.toml").read_text()) for r in (again, right))
+    assert table | {"name": right.name} == original
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("meshes/palm.glb", "../palm.glb"), "lies outside the folder"),
+        (('xyz="0 0 0.0752"', 'xyz="0 0"'), "<origin> that cannot be read"),
+        (("</robot>", ""), "no XML"),
+    ],
+)
+def test_what_cannot_be_mirrored_is_refused(change: tuple[str, str], words: str, right: RobotDescription):
+    with pytest.raises(InputError, match=words):
+        mirrored_urdf(right.urdf.read_text().replace(*change), "image", right.name)
+
+
+def test_a_robot_is_not_overwritten_by_its_image(right: RobotDescription):
+    with pytest.raises(InputError, match="is the robot itself"):
+        write_mirrored(right.folder, right.folder)
