@@ -10,7 +10,8 @@ import pytest
 
 TOP_LEVEL = {
     ".ci", ".gitignore", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "README.md", "docs", "dora",
-    "examples", "experiments", "hatch_build.py", "objects", "pyproject.toml", "results", "robots", "tests",
+    "examples", "experiments", "hatch_build.py", "mkdocs.yml", "objects", "pyproject.toml", "results", "robots",
+    "tests",
 }  # fmt: skip
 """All that lies in the repository's root."""
 MOST_FILES = 14
