@@ -139,3 +139,20 @@ def test_a_notebook_becomes_a_page_with_pictures() -> None:
     assert "[grasps](grasps.md)" in page
     assert page.index("```python\nprint()\n```") < page.index("```text\none\ntwo\n```") < page.index("![](tour/0.png)")
     assert pictures == {"tour/0.png": b"\x00\x01\x02"}
+
+
+def after_a_gap(page: str) -> list[int]:
+    """Numbers of the lines that follow an empty one and are indented by one to three spaces, outside of fences."""
+    found, fenced, before = [], False, ""
+    for number, line in enumerate(page.splitlines(), 1):
+        if not fenced and not before.strip() and re.match(r" {1,3}\S", line):
+            found.append(number)
+        fenced ^= line.lstrip().startswith("```")
+        before = line
+    return found
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: str(page.relative_to(DOCS)))
+def test_what_belongs_to_an_item_of_a_list_is_indented_by_four_spaces(page: Path) -> None:
+    """GitHub needs fewer, but mkdocs ends the list there."""
+    assert not after_a_gap(page.read_text())
