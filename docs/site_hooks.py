@@ -44,12 +44,12 @@ def at_a_glance(table: str) -> str:
 
 
 def notebook_page(cells: list[dict[str, Any]]) -> tuple[str, dict[str, bytes]]:
-    """A notebook as a page in Markdown, and its pictures by their paths; text in outputs is shown as it is."""
+    """A notebook as a page in Markdown, and its pictures by their paths; text in outputs is shown as it is, and that of stderr left out."""
     parts, pictures = [], {}
     for cell in cells:
         source = "".join(cell["source"])
         parts.append(f"```python\n{source}\n```" if cell["cell_type"] == "code" else source.replace(DOCS, ""))
-        for output in cell.get("outputs", []):
+        for output in (one for one in cell.get("outputs", []) if one.get("name") != "stderr"):
             if "image/png" in (data := output.get("data", {})):
                 path = f"{NOTEBOOK.stem}/{len(pictures)}.png"
                 pictures[path] = base64.b64decode("".join(data["image/png"]))

@@ -28,8 +28,7 @@ def printed(outputs: list[Any]) -> str:
 def test_the_notebook_is_stored_with_its_outputs() -> None:
     assert NOTEBOOK.stat().st_size < LARGEST
     outputs = [output for cell in cells("code") for output in cell["outputs"]]
-    assert {output["output_type"] for output in outputs} == {"stream", "display_data"}
-    assert {output["name"] for output in outputs if output["output_type"] == "stream"} == {"stdout"}
+    assert not [output for output in outputs if output["output_type"] == "error"]
     assert sum("image/png" in output.get("data", {}) for output in outputs) >= 6
     assert all(cell["outputs"] for cell in cells("code")[1:])
     assert "of 8 episodes succeed" in printed(outputs)

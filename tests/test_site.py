@@ -128,6 +128,7 @@ def test_equations_become_mathml() -> None:
 
 def test_a_notebook_becomes_a_page_with_pictures() -> None:
     outputs = [
+        {"output_type": "stream", "name": "stderr", "text": ["a warning\n"]},
         {"output_type": "stream", "name": "stdout", "text": ["one\n", "two\n"]},
         {"output_type": "display_data", "data": {"image/png": "AAEC\n", "text/plain": ["<Figure>"]}},
     ]
@@ -138,6 +139,7 @@ def test_a_notebook_becomes_a_page_with_pictures() -> None:
     page, pictures = hooks()["notebook_page"](cells)
     assert "[grasps](grasps.md)" in page
     assert page.index("```python\nprint()\n```") < page.index("```text\none\ntwo\n```") < page.index("![](tour/0.png)")
+    assert "warning" not in page
     assert pictures == {"tour/0.png": b"\x00\x01\x02"}
 
 
