@@ -44,7 +44,7 @@ def at_a_glance(table: str) -> str:
 
 
 def notebook_page(cells: list[dict[str, Any]]) -> tuple[str, dict[str, bytes]]:
-    """A notebook as a page in Markdown, and its pictures by their paths; text in outputs is shown as it is, and that of stderr left out."""
+    """A notebook as a page in Markdown, and its pictures by their paths; what went to stderr is left out."""
     parts, pictures = [], {}
     for cell in cells:
         source = "".join(cell["source"])

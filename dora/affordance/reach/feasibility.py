@@ -173,7 +173,8 @@ class Reach:
         """Collision-free way points (k, dof) between two arm postures [rad], or None if none are found.
 
         Args:
-            start, goal: (dof,) arm joints [rad].
+            start: (dof,) arm joints at the beginning [rad].
+            goal: (dof,) arm joints at the end [rad].
             hand: (h,) hand joints during the motion [rad].
             object_p: (3,) position of the object in the world [m].
             object_q: (4,) orientation of the object in the world, wxyz.
