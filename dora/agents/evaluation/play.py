@@ -100,22 +100,28 @@ def record(
     """
     task: Any = make_task()
     try:
-        low, high = (torch.as_tensor(x) for x in (task.single_action_space.low, task.single_action_space.high))
-        act = act or no_correction(len(low))
+        act = act or no_correction(len(task.single_action_space.low))
         path.parent.mkdir(parents=True, exist_ok=True)
-        with torch.no_grad():
-            first = _frames(task, act, first_seed, low, high)
-            rate = getattr(task, "control_freq", FRAMES_PER_SECOND)
-            with imageio.get_writer(path, fps=rate, macro_block_size=8) as writer:
-                for episode in range(episodes):
-                    frames = first if episode == 0 else _frames(task, act, first_seed + episode, low, high)
-                    for frame in frames:
-                        writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
+        first = episode_frames(task, act, first_seed)
+        rate = getattr(task, "control_freq", FRAMES_PER_SECOND)
+        with imageio.get_writer(path, fps=rate, macro_block_size=8) as writer:
+            for episode in range(episodes):
+                for frame in first if episode == 0 else episode_frames(task, act, first_seed + episode):
+                    writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
     finally:
         task.close()
 
 
-def _frames(task: Any, act: Act, seed: int, low: Tensor, high: Tensor) -> list[np.ndarray]:
+@torch.no_grad()
+def episode_frames(task: Any, act: Act, seed: int) -> list[UInt8[np.ndarray, "h w 3"]]:
+    """What `render` shows of an episode, from its start until its time is over or it has failed.
+
+    Args:
+        task: one environment that can render.
+        act: the policy.
+        seed: of the start.
+    """
+    low, high = (torch.as_tensor(x) for x in (task.single_action_space.low, task.single_action_space.high))
     observation, _ = task.reset(seed=seed)
     frames = [_picture(task.render())]
     for _ in range(task.max_steps):

@@ -1,0 +1,61 @@
+"""Films of policies: one palette, one size, the moments in which something happens; without a driver one sentence."""
+
+import io
+
+import numpy as np
+from pictures import run_without_driver
+from PIL import Image, ImageSequence
+
+from dora.tools.films import MOMENTS, RATE, SIDE, Episode, _small, as_gif, strip
+from dora.tools.stage_pictures import GAP
+
+
+def moving(count: int, rate: float) -> Episode:
+    """A white square that moves in the first half of an episode and rests in the second."""
+    frames = []
+    for k in range(count):
+        frame = np.zeros((SIDE, SIDE, 3), np.uint8)
+        at = 2 * min(k, count // 2)
+        frame[50:90, at : at + 40] = 255
+        frames.append(frame)
+    return Episode(frames, rate, True)
+
+
+def test_a_film_has_the_pictures_of_all_episodes_at_its_rate():
+    film = Image.open(io.BytesIO(as_gif([moving(40, 2 * RATE), moving(20, 2 * RATE)])))
+    frames, durations = [], []
+    for frame in ImageSequence.Iterator(film):  # equal ones in a row are one that lasts
+        frames.append(np.asarray(frame.convert("RGB")))
+        durations.append(frame.info["duration"])
+    assert sum(durations) == 30 * 1000 / RATE
+    assert frames[0].shape == (SIDE, SIDE, 3)
+    assert frames[5][60, 2 * 10 + 20].min() > 200
+    assert frames[5][60, 150].max() < 50
+
+
+def test_a_strip_shows_the_moments_in_which_something_happens():
+    episode = moving(100, RATE)
+    picture = strip(episode)
+    assert picture.shape == (SIDE, MOMENTS * SIDE + (MOMENTS - 1) * GAP, 3)
+    parts = [picture[:, k * (SIDE + GAP) : k * (SIDE + GAP) + SIDE] for k in range(MOMENTS)]
+    np.testing.assert_array_equal(parts[0], episode.pictures[0])
+    np.testing.assert_array_equal(parts[-1], episode.pictures[-1])
+    places = [int(part[60].any(-1).argmax()) for part in parts]
+    assert np.diff(places).min() >= 2 * 5  # it moves between any two, though it rests half of the time
+
+
+def test_a_picture_of_any_shape_becomes_a_square_of_its_middle():
+    wide = np.zeros((300, 500, 3), np.uint8)
+    wide[:, 100:400] = 255
+    assert _small(wide).shape == (SIDE, SIDE, 3)
+    assert _small(wide).min() == 255
+
+
+def test_without_a_driver_films_end_in_one_sentence(tmp_path):
+    out = tmp_path / "films"
+    program = f"import sys; sys.argv[1:] = ['--out', {str(out)!r}]; from dora.tools.films import main; main()"
+    result = run_without_driver(program)
+    assert result.returncode == 2
+    assert "No film: SAPIEN finds no Vulkan driver here" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not out.exists()
