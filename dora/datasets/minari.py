@@ -24,8 +24,6 @@ VERSION = "0.5.4"
 """Version of Minari whose format is written."""
 DATA, DESCRIPTION = "data/main_data.hdf5", "data/metadata.json"
 """Files of a dataset."""
-REQUIREMENT = "dora-manipulation"
-"""Distribution that makes the environment."""
 MEGABYTE = 1e6
 """Bytes of a megabyte as the format counts them [bytes]."""
 
@@ -78,8 +76,7 @@ def write_minari(
             "dataset_id": dataset_id(facts.env_id, name), "data_format": "hdf5", "minari_version": VERSION,
             "total_episodes": count, "total_steps": steps, "env_spec": spec.to_json(),
             "observation_space": _space(facts.observation_space), "action_space": _space(facts.action_space),
-            "dataset_size": round((folder / DATA).stat().st_size / MEGABYTE, 1), "requirements": [REQUIREMENT],
-            "algorithm_name": name, "description": f"{facts.task} {description}",
+            "dataset_size": round((folder / DATA).stat().st_size / MEGABYTE, 1), "algorithm_name": name, "description": f"{facts.task} {description}",
         },
     )  # fmt: skip
 

@@ -77,9 +77,21 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]], index: str | None
     path.parent.mkdir(parents=True, exist_ok=True)
     table = pyarrow.Table.from_pylist([dict(row) for row in rows])
     if index is not None:
-        said = {"index_columns": [index], "column_indexes": [], "columns": [], "pandas_version": None}
-        table = table.replace_schema_metadata({"pandas": json.dumps(said)})
+        table = table.replace_schema_metadata({"pandas": json.dumps(_pandas(table, index))})
     pyarrow.parquet.write_table(table, path)
+
+
+def _pandas(table: Any, index: str) -> dict[str, Any]:
+    """What pandas has to know of a table to take one of its columns as the index."""
+    columns = [
+        {"name": field.name, "field_name": field.name, "pandas_type": _kind(field.type), "numpy_type": _kind(field.type)}
+        for field in table.schema
+    ]
+    return {"index_columns": [index], "column_indexes": [], "columns": columns, "pandas_version": None}
+
+
+def _kind(arrow: Any) -> str:
+    return "unicode" if str(arrow) == "string" else str(arrow)
 
 
 def _column(values: np.ndarray) -> Any:
