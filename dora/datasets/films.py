@@ -27,7 +27,7 @@ class Film:
         rate: pictures per second [Hz].
     """
 
-    def __init__(self, folder: Path, template: str, files_per_chunk: int, size: float, rate: int):
+    def __init__(self, folder: Path, template: str, files_per_chunk: int, size: int | float, rate: int):
         self.folder, self.template, self.files_per_chunk = folder, template, files_per_chunk
         self.size, self.rate = size, rate
         self._number, self._frames, self._path, self._writer = 0, 0, folder, None

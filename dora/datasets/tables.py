@@ -39,7 +39,7 @@ class EpisodeTable:
         size: above which a further file is begun [MB of 2^20 bytes].
     """
 
-    def __init__(self, folder: Path, template: str, files_per_chunk: int, size: float):
+    def __init__(self, folder: Path, template: str, files_per_chunk: int, size: int | float):
         self.folder, self.template, self.files_per_chunk, self.size = folder, template, files_per_chunk, size
         self._number, self._path, self._writer = 0, folder, None
 
