@@ -41,8 +41,9 @@ class Actor(GaussianMixin, Model):
         Model.__init__(self, **spaces)
         GaussianMixin.__init__(self)
         self.net = layers(self.num_observations, self.num_actions)
+        last: Any = self.net[-1]
+        nn.init.zeros_(last.weight)  # begins near the zero action, which executes the reference
         self.log_std = nn.Parameter(torch.full((self.num_actions,), -1.0))
-        nn.init.zeros_(self.net[-1].weight)  # begins as the zero action, which executes the reference
 
     def compute(self, inputs: dict[str, Any], role: str = "") -> tuple[Tensor, dict[str, Any]]:
         return self.net(inputs["observations"]), {"log_std": self.log_std}
@@ -60,7 +61,7 @@ class Critic(DeterministicMixin, Model):
         return self.net(inputs["observations"]), {}
 
 
-def evaluate(agent: PPO, batch: gym.Env) -> str:
+def evaluate(agent: PPO, batch: Any) -> str:
     """Mean return and share of successes of whole episodes, one in each environment, with the mean action."""
     observations, _ = batch.reset(seed=1_000_000)
     returns, success, over = torch.zeros(len(observations)), torch.zeros(len(observations)), False

@@ -181,9 +181,7 @@ class _Trace:
 
     def episode(self, row: int, seed: int) -> Episode:
         steps = {name: np.stack([value[row] for value in values]) for name, values in self._steps.items()}
-        pictures = {
-            name: np.stack([part[name][row] for part in self._pictures]) for name in self._pictures[0]
-        }
+        pictures = {name: np.stack([part[name][row] for part in self._pictures]) for name in self._pictures[0]}
         return Episode(seed, np.stack([o[row] for o in self._observations]), **steps, pictures=pictures)
 
 

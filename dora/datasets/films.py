@@ -41,9 +41,9 @@ class Film:
             "video.pix_fmt": PIXELS, "video.fps": rate, "video.is_depth_map": False, "has_audio": False,
         }  # fmt: skip
 
-    def add(self, pictures: UInt8[np.ndarray, "t h w 3"]) -> dict[str, float]:
+    def add(self, pictures: UInt8[np.ndarray, "t h w 3"]) -> dict[str, int | float]:
         """Append the pictures of an episode; where they are: chunk, file, and times in the file [s]."""
-        if self._writer is not None and self._path.stat().st_size > self.size * MEGABYTE:
+        if self._writer is not None and self._written > self.size * MEGABYTE:
             self.close()
             self._number, self._frames = self._number + 1, 0
         chunk, file = divmod(self._number, self.files_per_chunk)
@@ -59,6 +59,11 @@ class Film:
         start, self._frames = self._frames, self._frames + len(pictures)
         times = {"from_timestamp": start / self.rate, "to_timestamp": self._frames / self.rate}
         return {"chunk_index": chunk, "file_index": file, **times}
+
+    @property
+    def _written(self) -> int:
+        """Size of the file so far [bytes]; the encoder makes it some pictures later."""
+        return self._path.stat().st_size if self._path.exists() else 0
 
     def close(self) -> None:
         """Finish the file that is being written."""

@@ -69,22 +69,21 @@ def write_minari(
         disable_env_checker=True,
         kwargs={"env_id": facts.env_id, **options},
     )
-    name, description = source
+    name, text = source
+    size = round((folder / DATA).stat().st_size / MEGABYTE, 1)
     write_json(
         folder / DESCRIPTION,
         {
             "dataset_id": dataset_id(facts.env_id, name), "data_format": "hdf5", "minari_version": VERSION,
-            "total_episodes": count, "total_steps": steps, "env_spec": spec.to_json(),
+            "total_episodes": count, "total_steps": steps, "dataset_size": size, "env_spec": spec.to_json(),
             "observation_space": _space(facts.observation_space), "action_space": _space(facts.action_space),
-            "dataset_size": round((folder / DATA).stat().st_size / MEGABYTE, 1), "algorithm_name": name, "description": f"{facts.task} {description}",
+            "algorithm_name": name, "description": f"{facts.task} {text}",
         },
     )  # fmt: skip
 
 
 def _write_episode(group: h5py.Group, number: int, episode: Episode) -> None:
-    group.attrs.update(
-        {"id": number, "seed": episode.seed, "total_steps": len(episode), "success": episode.success}
-    )
+    group.attrs.update({"id": number, "seed": episode.seed, "total_steps": len(episode), "success": episode.success})
     values = {
         "observations": episode.observations,
         "actions": episode.actions,

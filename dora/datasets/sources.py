@@ -38,7 +38,9 @@ def find_source(env_id: str, which: str, preset: str | None = None) -> Source:
         find_preset(preset)
     if which == SCRIPTED:
         options = {**USUAL, "guidance": "none", "preset": preset or "standard"}
-        return Source(SCRIPTED, "The scripted solution executes the chosen grasp candidate.", env_id, options, _scripted)
+        return Source(
+            SCRIPTED, "The scripted solution executes the chosen grasp candidate.", env_id, options, _scripted
+        )
     policy = load_policy(env_id if which == BUNDLED else Path(which))
     if policy.env_id != env_id:
         raise InputError(f"{which} is a policy of {policy.env_id}, not of {env_id}: name the task that it is of.")

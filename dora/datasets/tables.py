@@ -84,7 +84,12 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]], index: str | None
 def _pandas(table: Any, index: str) -> dict[str, Any]:
     """What pandas has to know of a table to take one of its columns as the index."""
     columns = [
-        {"name": field.name, "field_name": field.name, "pandas_type": _kind(field.type), "numpy_type": _kind(field.type)}
+        {
+            "name": field.name,
+            "field_name": field.name,
+            "pandas_type": _kind(field.type),
+            "numpy_type": _kind(field.type),
+        }
         for field in table.schema
     ]
     return {"index_columns": [index], "column_indexes": [], "columns": columns, "pandas_version": None}
