@@ -214,7 +214,7 @@ def test_the_description_makes_an_environment_in_which_actions_do_the_same(recor
 
 
 def test_a_dataset_says_how_it_was_made(recorded: Path):
-    own = json.loads((recorded / "dora.json").read_text())
+    own = json.loads((recorded / "recording.json").read_text())
     assert (own["env"], own["policy"], own["options"]["guidance"]) == (ENV, "scripted", "none")
     assert sorted(row["seed"] for row in own["episodes"]) == [5, 6, 7]
     assert list(recorded.parent.iterdir()) == [recorded]
@@ -290,7 +290,7 @@ def test_maniskills_recording_holds_the_episodes_up_to_their_ends(tmp_path: Path
     source = find_source(ENV, "policy", "none")
     made = record_dataset("maniskill", source, Plan(2, seed=5, num_envs=2), tmp_path / "out")
     index = json.loads((tmp_path / "out/demonstrations.json").read_text())
-    own = json.loads((tmp_path / "out/dora.json").read_text())
+    own = json.loads((tmp_path / "out/recording.json").read_text())
     assert index["env_info"]["env_id"] == f"dora:{ENV}"
     with h5py.File(tmp_path / "out/demonstrations.h5") as file:
         assert len(file) == made.episodes == 2
@@ -381,7 +381,7 @@ def test_minari_reads_it(recorded: Path):
     env = dataset.recover_environment()
     assert env.observation_space == dataset.observation_space
     assert env.action_space == dataset.action_space
-    episodes, own = list(dataset.iterate_episodes()), json.loads((recorded / "dora.json").read_text())["episodes"]
+    episodes, own = list(dataset.iterate_episodes()), json.loads((recorded / "recording.json").read_text())["episodes"]
     assert [len(e.actions) for e in episodes] == [row["steps"] for row in own]
     assert [bool(e.infos["success"][-1]) for e in episodes] == [row["success"] for row in own]
 

@@ -25,7 +25,7 @@ from dora.version import version_line
 
 FORMATS = ("lerobot", "minari", "maniskill")
 """Formats of datasets."""
-OWN = "dora.json"
+OWN = "recording.json"
 """File of a dataset that says how it was made, and lists seed, length and success of its episodes."""
 LAST_SEED = 2**31 - 1
 """Largest seed of a start."""
