@@ -15,6 +15,7 @@ from dora.version import version_line
 COMMANDS = {
     "run": "train or evaluate a learner on a task",
     "play": "watch a policy live on a web page, and disturb it",
+    "demos": "record demonstrations, or episodes of a policy, as a dataset",
     "grasps": "search for grasps of an object, judge them, and store them",
     "view": "show an object, its regions and its grasps on a web page",
     "bench": "measure how fast the parts of Dora are",

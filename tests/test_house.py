@@ -18,7 +18,7 @@ MOST_FILES = 14
 """Modules side by side in one folder, besides tests [1]."""
 MOST_LINES = 400
 """Lines of a module [1]; about 300 are the aim."""
-SCRIPTS = ("bench", "grasps", "play", "report", "run", "view")
+SCRIPTS = ("bench", "demos", "grasps", "play", "report", "run", "view")
 """Commands of experiments/."""
 OURS = {"DoraEnv", "DescribedRobot", "Task"}
 """Classes that users subclass."""

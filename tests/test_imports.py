@@ -13,7 +13,8 @@ LEVELS = {
     "affordance.reach": 8, "affordance.views": 9,
     "sim.batch": 10, "sim": 11, "sim.grasp_tests": 12,
     "tasks.mdp": 13, "tasks.guidance": 14, "tasks.env": 15, "tasks.hammer": 16, "tasks": 17,
-    "registration": 18, "tools": 18, "live": 18, "policies": 18.5, "integrations": 18.5, "commands": 19, "__main__": 20,
+    "registration": 18, "tools": 18, "live": 18, "policies": 18.5, "integrations": 18.5, "datasets": 18.7,
+    "commands": 19, "__main__": 20,
 }  # fmt: skip
 """A room may import itself and rooms of a lower level; a room inside one that is not listed belongs to it."""
 LEARNERS = {

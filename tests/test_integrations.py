@@ -1,5 +1,7 @@
 """Batches as environments of other libraries: TorchRL and Stable-Baselines3."""
 
+import subprocess
+import sys
 from typing import Any
 
 import gymnasium as gym
@@ -56,6 +58,27 @@ def test_torchrl_sees_what_gymnasium_sees():
     assert not torch.equal(partly["observation"][0], obs[0])
     env.close()
     bare.close()
+
+
+def test_gymnasium_makes_a_batch_as_a_vector_environment():
+    """In a process that has not imported Dora: the prefix does it."""
+    code = """
+import gymnasium as gym, numpy as np
+env = gym.make_vec("dora:DoraCube-v1", num_envs=3, max_episode_steps=4)
+assert isinstance(env, gym.vector.VectorEnv)
+obs, _ = env.reset(seed=5)
+ends = [bool(env.step(np.zeros(env.action_space.shape))[3].all()) for _ in range(8)]
+print(type(env).__name__, tuple(obs.shape), [k for k, over in enumerate(ends) if over])
+single = gym.make("dora:DoraCube-v1", max_episode_steps=2)
+first, _ = single.reset(seed=5)
+print([bool(single.step(None)[3]) for _ in range(2)], bool((first[0] == obs[0]).all()))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-2:] == [
+        "ManiSkillVectorEnv (3, 211) [3, 7]",
+        "[False, True] True",
+    ]
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import tyro
 
 from dora.agents.config import LEARNER_CONFIGS
 from dora.agents.runs.recommended import recommended
-from dora.commands import bench, grasps, play, report, run, view
+from dora.commands import bench, demos, grasps, play, report, run, view
 from dora.tasks import find_task
 from dora.tasks.env.options import task_config
 
@@ -58,6 +58,7 @@ def _bench() -> Any:
 FORMS = {
     "run": _run,
     "play": lambda: play.Args,
+    "demos": lambda: demos.Args,
     "grasps": lambda: grasps.Args,
     "view": lambda: view.Args,
     "bench": _bench,

@@ -1,0 +1,1 @@
+"""Datasets of demonstrations and of policies, in the formats of LeRobot, Minari and ManiSkill."""
