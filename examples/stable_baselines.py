@@ -18,7 +18,7 @@ parser.add_argument("--episodes", type=int, default=100, help="episodes of the e
 parser.add_argument("--seed", type=int, default=0)
 args = parser.parse_args()
 
-env = make(args.env, num_envs=args.num_envs)
+env = make(args.env, num_envs=args.num_envs, ignore_terminations=True)
 model = PPO(
     "MlpPolicy", env, n_steps=16, batch_size=256, n_epochs=4, gamma=0.98, learning_rate=3e-4, seed=args.seed,
     policy_kwargs={"net_arch": [256, 128], "log_std_init": -1.0}, device="cpu", verbose=1,

@@ -116,6 +116,39 @@ def test_a_vecenv_ends_and_begins_episodes(sb3: Any, env_id: str):
     env.close()
 
 
+class Succeeding(gym.Env):
+    """Two environments, the first of which succeeds in its second step; time is over after four."""
+
+    num_envs = 2
+    single_observation_space = gym.spaces.Box(-1, 1, (1,))
+    single_action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[torch.Tensor, dict]:
+        rows = torch.arange(2) if options is None else torch.as_tensor(options["env_idx"])
+        self.steps = getattr(self, "steps", torch.zeros(2, dtype=torch.int64))
+        self.steps[rows] = 0
+        return self.steps[:, None] / 4, {}
+
+    def step(self, action: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, dict]:
+        self.steps += 1
+        success = (self.steps >= 2) & torch.tensor([True, False])
+        return self.steps[:, None] / 4, torch.ones(2), success, self.steps >= 4, {"success": success}
+
+
+@pytest.mark.parametrize(
+    ("ignored", "ends"), [(False, [[1, 3, 5, 7], [3, 7]]), (True, [[3, 7], [3, 7]])], ids=["ends", "goes on"]
+)
+def test_a_success_ends_an_episode_unless_that_is_ignored(sb3: Any, ignored: bool, ends: list[list[int]]):
+    from dora.integrations.sb3 import BatchVecEnv
+
+    env = BatchVecEnv(Succeeding(), ignored)
+    env.reset()
+    steps = [env.step(np.zeros((2, 1))) for _ in range(8)]
+    assert [[k for k, (_, _, done, _) in enumerate(steps) if done[row]] for row in range(2)] == ends
+    info = steps[ends[0][0]][3][0]
+    assert (info["is_success"], info["TimeLimit.truncated"]) == (True, ignored)
+
+
 def test_stable_baselines_learns_and_evaluates_on_it(sb3: Any):
     from stable_baselines3.common.evaluation import evaluate_policy
 

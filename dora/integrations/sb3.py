@@ -18,18 +18,20 @@ from torch import Tensor
 from dora.integrations.batches import make_batch
 
 
-def make(env_id: str, num_envs: int = 16, **options: Any) -> VecEnv:
+def make(env_id: str, num_envs: int = 16, ignore_terminations: bool = False, **options: Any) -> VecEnv:
     """A batch as a `VecEnv` that reports returns, lengths and successes of its episodes to Stable-Baselines3.
 
     Args:
         env_id: id of Dora or ManiSkill.
         num_envs: environments in the batch.
+        ignore_terminations: let an episode last until its time is over. Otherwise a success ends it, and as nothing is
+            counted after that, a learner with a dense reward would rather not succeed.
         options: further arguments of `gym.make`, such as `guidance="none"` or `max_episode_steps=50`.
 
     Raises:
         InputError: if observations or actions are no array.
     """
-    return VecMonitor(BatchVecEnv(make_batch(env_id, num_envs, options)))
+    return VecMonitor(BatchVecEnv(make_batch(env_id, num_envs, options), ignore_terminations))
 
 
 class BatchVecEnv(VecEnv):
@@ -40,10 +42,11 @@ class BatchVecEnv(VecEnv):
 
     Args:
         env: a batched environment with arrays as observations and actions, see `make_batch`.
+        ignore_terminations: episodes end when their time is over, and not by success or failure.
     """
 
-    def __init__(self, env: gym.Env):
-        self.env, self._actions = env, np.zeros(0)
+    def __init__(self, env: gym.Env, ignore_terminations: bool = False):
+        self.env, self._actions, self._ignore = env, np.zeros(0), ignore_terminations
         spaces = (env.get_wrapper_attr(f"single_{what}_space") for what in ("observation", "action"))
         super().__init__(env.get_wrapper_attr("num_envs"), *spaces)
         self.metadata = env.metadata
@@ -62,11 +65,12 @@ class BatchVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """One control step: observations (n, o), rewards (n,), which episodes ended (n,), and infos."""
         obs, reward, terminated, truncated, info = self.env.step(self._actions)
-        obs, ended = _array(obs), _array(terminated) | _array(truncated)
+        over = _array(terminated) & (not self._ignore)
+        obs, ended = _array(obs), over | _array(truncated)
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
         rows = np.flatnonzero(ended)
         if len(rows):
-            over, success = _array(terminated), info.get("success")
+            success = info.get("success")
             for row in rows.tolist():
                 infos[row] = {"terminal_observation": obs[row].copy(), "TimeLimit.truncated": not over[row]}
                 infos[row] |= {} if success is None else {"is_success": bool(success[row])}
