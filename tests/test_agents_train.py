@@ -85,6 +85,7 @@ def test_ppo_learns_and_leaves_a_complete_folder(tmp_path: Path):
     assert zero is not None
 
 
+@pytest.mark.slow
 def test_sac_learns(tmp_path: Path):
     learner = SACConfig(
         batch=64, updates_per_step=1 / 8, warmup=500, critic_only=50, n_step=3, prior=0.0, log_std_max=-0.4,
@@ -140,7 +141,9 @@ def test_stop_success_needs_two_evaluations_in_a_row(tmp_path: Path):
     assert run(tmp_path / "run", config)["env_steps"] == 1024
 
 
-@pytest.mark.parametrize(("agent", "learner"), [("ppo", SMALL_PPO), ("sac", SMALL_SAC)])
+@pytest.mark.parametrize(
+    ("agent", "learner"), [("ppo", SMALL_PPO), pytest.param("sac", SMALL_SAC, marks=pytest.mark.slow)]
+)
 def test_worker_processes_learn_repeat_and_leave_nothing_behind(tmp_path: Path, agent: str, learner: Any):
     config = dataclasses.replace(BASE, agent=agent, workers=2, num_envs=8, learner=learner, total_steps=2048)
     before = children()
@@ -160,6 +163,7 @@ class Slow(PointMass):
         return super().step(action)
 
 
+@pytest.mark.slow
 def test_batches_collected_ahead_are_of_the_policy_before():
     learner = PPO(dataclasses.replace(SMALL_PPO, log_std=-3.0), 4, 2, 1000)
     actor: Any = learner.actor

@@ -174,6 +174,7 @@ def test_the_ground_carries_objects_in_every_environment():
     env.close()
 
 
+@pytest.mark.slow
 def test_closing_leaks_nothing():
     process = psutil.Process()
 

@@ -14,6 +14,7 @@ from dora.errors import InputError
 from dora.tools.demonstrations import record_demonstrations
 
 
+@pytest.mark.slow
 def test_successes_are_recorded_and_can_be_played_again(tmp_path: Path):
     made = record_demonstrations("DoraJug-v1", tmp_path, tries=3, num_envs=3, seed=5, preset="none")
     assert made.tried == 3

@@ -83,6 +83,7 @@ def test_every_example_is_run():
     assert {path.stem for path in DEMO.parent.glob("*.py")} == set(EXAMPLES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_an_example_runs(name):
     arguments, printed = EXAMPLES[name]

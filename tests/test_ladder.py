@@ -83,6 +83,7 @@ def test_the_filter_leaves_only_what_it_accepts(monkeypatch: pytest.MonkeyPatch)
     assert even["free"] < 0.9
 
 
+@pytest.mark.slow
 def test_what_f_reach_rejects_fails_more_than_twice_as_often():
     found = outcomes("DoraJug-v1", 64, "none", "random")
     accepted, rejected = found.failure_rates()

@@ -24,6 +24,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.path
 
 
+@pytest.mark.slow
 def test_a_demonstration_of_a_batch_succeeds_again_alone(recording: Path):
     opened = Recording.open(recording)
     assert (opened.env_id, opened.options["guidance"]) == ("DoraCube-v1", "none")

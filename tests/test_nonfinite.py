@@ -122,7 +122,9 @@ def test_a_bad_row_that_is_not_reset_goes_on_healthy():
     env.close()
 
 
-@pytest.mark.parametrize("env_id", ["PickCube-v1", "DoraCube-v1", "DoraHammer-v1"])
+@pytest.mark.parametrize(
+    "env_id", ["PickCube-v1", "DoraCube-v1", pytest.param("DoraHammer-v1", marks=pytest.mark.slow)]
+)
 def test_the_other_rows_are_bit_identical(env_id: str):
     """Two equal batches, in one of which a row is spoilt again and again; contacts included."""
     results = []

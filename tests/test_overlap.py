@@ -74,6 +74,7 @@ def test_nothing_deeper_than_what_is_reported_happens():
     assert true.max() > 1.0  # the test sees something
 
 
+@pytest.mark.slow
 def test_persistent_contacts_let_fingers_into_the_cube():
     """Why the cube does without them: a finger that slides over an edge sinks in, and no contact is reported."""
     assert reported_and_true(persistent=True)[1].max() > 4.0

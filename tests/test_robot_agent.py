@@ -200,6 +200,7 @@ print(time.perf_counter() - start)
 """
 
 
+@pytest.mark.slow
 def test_import_dora_costs_little_more_than_maniskill(record_property):
     """At most 0.5 s on top; the best of three, because other processes run as well."""
     cost = min(float(run(COST).stdout) for _ in range(3))

@@ -130,7 +130,7 @@ def test_nothing_that_is_not_finite_is_saved(tmp_path: Path):
     assert finite(weights(tmp_path))
 
 
-@pytest.mark.parametrize("ahead", [False, True])
+@pytest.mark.parametrize("ahead", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_worker_that_dies_leaves_a_run_that_goes_on(tmp_path: Path, ahead: bool):
     config = dataclasses.replace(SHORT_SAC if ahead else SHORT, workers=1)
     before = children()

@@ -23,6 +23,7 @@ from dora.tools.task_ranking import (
 )
 
 
+@pytest.mark.slow
 def test_a_proof_tells_a_good_grasp_from_one_in_the_air():
     good = hand_made_candidates().select([0])
     away = replace(good, position=good.position + torch.tensor([0.0, 0.0, 0.10]))

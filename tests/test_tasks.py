@@ -47,7 +47,7 @@ def batch(request: pytest.FixtureRequest) -> Iterator[DoraEnv]:
     task.close()
 
 
-@pytest.fixture(scope="module", params=["affordance", "none"])
+@pytest.fixture(scope="module", params=["affordance", pytest.param("none", marks=pytest.mark.slow)])
 def guidance(request: pytest.FixtureRequest) -> str:
     return request.param
 

@@ -1,4 +1,4 @@
-"""Films of the policies that come with the tasks: `python -m dora.tools.films`.
+"""Films of the policies that come with the tasks: `python -m dora.policies.films`.
 
 Writes <task>.gif, three episodes on consecutive seeds whether they succeed or not, and <task>-film.png, moments of the
 first of them, to docs/images, and says which episodes succeeded. Needs a Vulkan driver (docs/rendering.md).
