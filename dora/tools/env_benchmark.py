@@ -19,7 +19,7 @@ import dora  # noqa: F401  (registers Dora's tasks)
 from dora.errors import InputError
 from dora.parallel import run_cases
 from dora.sim import BACKEND, StepProfile, can_render
-from dora.sim.batch.rendering import refuse_pictures, wants_pictures
+from dora.sim.batch.rendering import refuse_pictures, replace_materials, wants_pictures
 
 MOST: dict[str, float] = {"num_envs": 100_000, "workers": 512, "seconds": 86_400}
 """Largest value of each number of a measurement."""
@@ -183,6 +183,8 @@ def _repeat(step: Callable[[], None], seconds: float) -> tuple[int, float]:
 
 def _single_env(env_id: str, obs_mode: str) -> gym.Env:
     torch.set_num_threads(1)
+    if not can_render():
+        replace_materials()  # of tasks that make some, which need a driver otherwise
     return CPUGymWrapper(gym.make(env_id, num_envs=1, sim_backend="physx_cpu", **_options(obs_mode)))
 
 
