@@ -103,7 +103,7 @@ class DescribedRobot(BaseAgent):
             self._add_shapes(link)
             link.collision_groups[2] |= bits.get(link.name, 0)
             # Bits of word 2 count only between shapes with one number here: robots do not ignore each other.
-            link.collision_groups[3] |= self._agent_idx or 0
+            link.collision_groups[3] |= int(self._agent_idx or 0)
         builder.initial_pose = initial_pose if initial_pose is not None else sapien.Pose()
         builder.set_scene_idxs(scene_idxs)
         return builder.build()
