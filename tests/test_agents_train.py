@@ -180,7 +180,7 @@ def test_batches_collected_ahead_are_of_the_policy_before():
     assert [round(mean) for mean in means] == [0, 0, 1, 2]
 
 
-@pytest.mark.parametrize("ahead", [False, True])
+@pytest.mark.parametrize("ahead", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_message_of_a_failing_worker_arrives(ahead: bool):
     learner = PPO(SMALL_PPO, 4, 2, 1000)
     rollouts = Rollouts(

@@ -64,7 +64,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("kill", [signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_workers_end_with_the_process_that_started_them(tmp_path: Path, kill: signal.Signals):
     (tmp_path / "script.py").write_text(SCRIPT)
     process = subprocess.Popen(

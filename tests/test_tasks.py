@@ -47,12 +47,17 @@ def batch(request: pytest.FixtureRequest) -> Iterator[DoraEnv]:
     task.close()
 
 
+def slow_for(*long: str) -> list:
+    """All tasks, some of which are left to the slow tests."""
+    return [pytest.param(name, marks=pytest.mark.slow) if name in long else name for name in tasks.task_ids()]
+
+
 @pytest.fixture(scope="module", params=["affordance", pytest.param("none", marks=pytest.mark.slow)])
 def guidance(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-@pytest.mark.parametrize("env_id", tasks.task_ids())
+@pytest.mark.parametrize("env_id", slow_for("DoraJug-v1"))
 @pytest.mark.filterwarnings("ignore")
 def test_gymnasium_contract(env_id: str):
     env = gym.make(env_id, obs_mode="state")
@@ -152,7 +157,7 @@ def test_partial_reset_leaves_the_others_bit_identical(batch: DoraEnv, which: li
         assert torch.equal(batch.step(a)[0][others], whole[13 + t][others])
 
 
-@pytest.mark.parametrize("env_id", tasks.task_ids())
+@pytest.mark.parametrize("env_id", slow_for("DoraJug-v1"))
 def test_a_batch_equals_singles(env_id: str):
     seeds = [11, 12, 13]
     task = tasks.make_task(env_id, len(seeds))
@@ -186,7 +191,7 @@ def test_the_script_visits_every_stage_in_order_and_succeeds(env_id: str, guidan
     task.close()
 
 
-@pytest.mark.parametrize("env_id", tasks.task_ids())
+@pytest.mark.parametrize("env_id", slow_for("DoraHammer-v1"))
 def test_no_observation_is_constant_and_all_are_finite(env_id: str, guidance: str):
     task = tasks.make_task(env_id, 8, guidance=guidance)
     obs, _ = task.reset(seed=2)
