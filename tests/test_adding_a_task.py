@@ -57,7 +57,7 @@ def added(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> tuple
 @pytest.mark.parametrize("toy", ["DoraBlock", "DoraPair"])
 def test_all_tests_of_tasks_pass_on_it(added: tuple[Path, dict[str, str]], project_root: Path, toy: str):
     """The second one has two arms that stand opposite each other, and two objects."""
-    options = ["-p", "toy_plugin", "-p", "no:cacheprovider", "-n", "0", "-k", toy, "tests/test_tasks.py"]
+    options = ["-p", "toy_plugin", "-p", "no:cacheprovider", "-n", "0", "-m", "", "-k", toy, "tests/test_tasks.py"]
     done = subprocess.run(
         [sys.executable, "-m", "pytest", *options], cwd=project_root, env=added[1], capture_output=True, text=True
     )
