@@ -63,6 +63,8 @@ def write_lerobot(folder: Path, facts: Facts, episodes: Iterable[Episode]) -> No
 
 
 class _Writer:
+    """Writes episodes one by one, and what describes them all at the end."""
+
     def __init__(self, folder: Path, facts: Facts):
         self.folder, self.facts = folder, facts
         self.rows: list[dict[str, Any]] = []
@@ -73,6 +75,7 @@ class _Writer:
         self.frames = 0
 
     def add(self, episode: Episode) -> None:
+        """Append the t steps of an episode to tables and films; its last observation has no place in the format."""
         if not self.rows:
             self.features = _features(self.facts, episode)
             self.films = {

@@ -95,12 +95,12 @@ def _link_lines(name: str, link: Row) -> list[str]:
     """`<link>` with inertial, visual and collision elements; an empty row is a bare frame."""
     if not link:
         return [f'  <link name="{escape(name)}"/>']
-    inertia = " ".join(f'{k}="{_number(v)}"' for k, v in zip(INERTIA_NAMES, link["inertia"], strict=True))
+    inertia = " ".join(f'{k}="{urdf_number(v)}"' for k, v in zip(INERTIA_NAMES, link["inertia"], strict=True))
     lines = [
         f'  <link name="{escape(name)}">',
         "    <inertial>",
         f"      {_origin(link['com'])}",
-        f'      <mass value="{_number(link["mass"])}"/>',
+        f'      <mass value="{urdf_number(link["mass"])}"/>',
         f"      <inertia {inertia}/>",
         "    </inertial>",
         f'    <visual><geometry><mesh filename="meshes/{escape(link["mesh"])}"/></geometry></visual>',
@@ -121,7 +121,7 @@ def _joint_lines(joint: Row) -> list[str]:
         f"    {_origin(joint['xyz'], joint['rpy'])}",
     ]
     if kind == "revolute":
-        limits = " ".join(f'{k}="{_number(joint[k])}"' for k in ("lower", "upper", "velocity", "effort"))
+        limits = " ".join(f'{k}="{urdf_number(joint[k])}"' for k in ("lower", "upper", "velocity", "effort"))
         lines += [f'    <axis xyz="{_vector(joint["axis"])}"/>', f"    <limit {limits}/>"]
     return [*lines, "  </joint>"]
 
@@ -131,19 +131,19 @@ def _box(shape: Row) -> list[tuple[str, str]]:
 
 
 def _sphere(shape: Row) -> list[tuple[str, str]]:
-    return [(_origin(shape["center"]), f'<sphere radius="{_number(shape["radius"])}"/>')]
+    return [(_origin(shape["center"]), f'<sphere radius="{urdf_number(shape["radius"])}"/>')]
 
 
 def _cylinder(shape: Row) -> list[tuple[str, str]]:
     start, end = shape["p0"], shape["p1"]
     center = [(a + b) / 2 for a, b in zip(start, end, strict=True)]
     rpy = rpy_from_z_axis([b - a for a, b in zip(start, end, strict=True)])
-    size = f'radius="{_number(shape["radius"])}" length="{_number(math.dist(start, end))}"'
+    size = f'radius="{urdf_number(shape["radius"])}" length="{urdf_number(math.dist(start, end))}"'
     return [(_origin(center, rpy), f"<cylinder {size}/>")]
 
 
 def _capsule(shape: Row) -> list[tuple[str, str]]:
-    ball = f'<sphere radius="{_number(shape["radius"])}"/>'
+    ball = f'<sphere radius="{urdf_number(shape["radius"])}"/>'
     return [*_cylinder(shape), (_origin(shape["p0"]), ball), (_origin(shape["p1"]), ball)]
 
 
@@ -156,10 +156,10 @@ def _origin(xyz: Sequence[int | float], rpy: Sequence[int | float] = (0.0, 0.0, 
 
 
 def _vector(values: Iterable[int | float]) -> str:
-    return " ".join(map(_number, values))
+    return " ".join(map(urdf_number, values))
 
 
-def _number(value: int | float) -> str:
+def urdf_number(value: int | float) -> str:
     """Shortest text with 12 significant digits, without negative zero."""
     return f"{float(value) + 0.0:.12g}"
 

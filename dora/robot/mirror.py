@@ -23,6 +23,7 @@ import trimesh
 from dora.errors import InputError
 from dora.files import make_folder, write_bytes
 from dora.reading import read_toml
+from dora.robot.build import urdf_number
 from dora.robot.loading import ROBOT_FILE, load_robot
 
 POINT, ANGLES, AXIS = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)
@@ -86,18 +87,13 @@ def _mirror(element: ET.Element, source: str) -> None:
     try:
         if element.tag == "inertia":
             for key in PRODUCTS:
-                element.set(key, _number(-float(element.get(key, "0"))))
+                element.set(key, urdf_number(-float(element.get(key, "0"))))
         for key, factors in (("xyz", AXIS if element.tag == "axis" else POINT), ("rpy", ANGLES)):
             if key in element.attrib:
                 values = zip(element.attrib[key].split(), factors, strict=True)
-                element.set(key, " ".join(_number(float(value) * factor) for value, factor in values))
+                element.set(key, " ".join(urdf_number(float(value) * factor) for value, factor in values))
     except ValueError as error:
         raise InputError(f"the URDF of {source!r} has an <{element.tag}> that cannot be read ({error}).") from error
-
-
-def _number(value: float) -> str:
-    """A number with 12 digits, never a negative zero."""
-    return f"{value + 0.0:.12g}"
 
 
 def mirrored_table(table: dict[str, Any], name: str) -> dict[str, Any]:

@@ -36,6 +36,7 @@ def register_task(env_id: str) -> Callable[[type[Task]], type[Task]]:
     """
 
     def register(task: type[Task]) -> type[Task]:
+        """Makes and registers the environment class of a task, which is returned unchanged."""
         name = task.__name__.removesuffix("Task") + "Env"
         members = {"TASK": task, "__doc__": task.__doc__, "__module__": task.__module__}
         env = type(name, (DoraEnv,), members)
