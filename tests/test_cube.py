@@ -30,7 +30,7 @@ def test_surface_distance_is_that_of_a_box():
     tips[0, :, 0] = torch.tensor([0.0, 0.02, 0.03, 0.08, 0.03])
     tips[0, 4, 1] = 0.07  # diagonal: 4 cm beside an edge
     expected = torch.tensor([[-0.03, -0.01, 0.0, 0.05, 0.04]]) - TIP_RADIUS
-    torch.testing.assert_close(cube.surface_distance(invented(1, tip_p=tips)), expected)
+    torch.testing.assert_close(cube.box_distance(invented(1, tip_p=tips)), expected)
 
 
 def test_lifting_pays_until_the_target_height_and_more_with_an_opposed_grasp():

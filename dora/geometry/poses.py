@@ -54,8 +54,9 @@ def carried(
     )
 
 
-def slew(start: Pose, goal: Pose, step: float, turn: float) -> Pose:
-    """From `start` towards `goal` on the straight line, by at most `step` [m] and `turn` [rad]."""
+def slew(start: Pose, goal: Pose, step: float | Float[Tensor, " n"], turn: float | Float[Tensor, " n"]) -> Pose:
+    """From `start` towards `goal` on the straight line, by at most `step` [m] and `turn` [rad]; one number for all, or
+    one for each."""
     shift = goal[0] - start[0]
     spin = rotation_vector_from_quaternion(quaternion_multiply(goal[1], quaternion_inverse(start[1])))
     steps = torch.maximum(shift.norm(dim=-1) / step, spin.norm(dim=-1) / turn).clamp(min=1)[:, None]

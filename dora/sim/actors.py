@@ -1,5 +1,6 @@
 """Objects as bodies of a simulation: convex pieces as collision shapes, the labelled mesh as visual."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -156,6 +157,44 @@ def build_object(
         part = builder.build(f"{name}-{i}")
         scene.remove_from_state_dict_registry(part)
         parts.append(part)
-    merged = Actor.merge(parts, name)
+    return _merged(scene, parts, name)
+
+
+def build_box(
+    scene: ManiSkillScene,
+    obj: AffordanceObject,
+    scale: Sequence[float] | np.ndarray,
+    colour: tuple[float, float, float, float],
+    pose: sapien.Pose,
+) -> Actor:
+    """An object as the box around its mesh, of uniform density, whose mass and inertia PhysX computes.
+
+    Args:
+        scene: the ManiSkill scene.
+        obj: the object.
+        scale: factor of all lengths, one per environment, which does not change the mass [1].
+        colour: red, green, blue and opacity, 0 to 1.
+        pose: initial pose in the world.
+    """
+    parts = []
+    for i, factor in enumerate(np.asarray(scale).tolist()):
+        half = (obj.mesh.extents / 2 * factor).tolist()
+        builder = scene.create_actor_builder()
+        # A material of its own: without one, every shape of every environment shares SAPIEN's default.
+        material = physx.PhysxMaterial(obj.friction, obj.friction, 0.0)
+        builder.add_box_collision(half_size=half, material=material, density=obj.mass / (8 * math.prod(half)))
+        if scene.can_render():
+            paint = sapien.render.RenderMaterial(base_color=list(colour), roughness=ROUGHNESS)
+            builder.add_box_visual(half_size=half, material=paint)
+        builder.set_scene_idxs([i])
+        builder.initial_pose = Pose.create(pose)
+        parts.append(builder.build(f"{obj.name}-{i}"))
+        scene.remove_from_state_dict_registry(parts[-1])
+    return _merged(scene, parts, obj.name)
+
+
+def _merged(scene: ManiSkillScene, parts: Sequence[Actor], name: str) -> Actor:
+    """One actor of those built for each environment, saved and restored under `name`."""
+    merged = Actor.merge(list(parts), name)
     scene.add_to_state_dict_registry(merged)
     return merged

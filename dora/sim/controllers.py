@@ -46,6 +46,8 @@ class WristHandController(BaseController):
     config: "WristHandConfig"
     sets_target_qpos = True
     sets_target_qvel = False
+    arm_effort = 1.0
+    """Share of their torque limits with which the drives of the arm work."""
 
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
@@ -85,6 +87,14 @@ class WristHandController(BaseController):
         self.wrist_scale = torch.tensor([speed] * 3 + [spin] * 3, device=self.device) * self.dt
         self.feed_forward = feed_forward
 
+    def limit_effort(self, share: float) -> None:
+        """Gives the drives of the arm a share of their torque limits, so that a hand that meets something pushes less.
+
+        The motion of the free arm needs little of them: it is bounded by its speed, not by its torques.
+        """
+        self.arm_effort = share
+        self.set_drive_property()
+
     @property
     def hand_size(self) -> int:
         """Number of hand components in the action: all joints, or the actuated ones if coupled."""
@@ -93,12 +103,12 @@ class WristHandController(BaseController):
     def set_drive_property(self) -> None:
         """Gains, effort limits and armature from the robot's description."""
         robot = self.config.robot
-        for group, joints in (
-            (robot.arm, self.joints[: self.arm_size]),
-            (robot.hand, self.joints[self.arm_size :]),
+        for group, joints, share in (
+            (robot.arm, self.joints[: self.arm_size], self.arm_effort),
+            (robot.hand, self.joints[self.arm_size :], 1.0),
         ):
             for i, joint in enumerate(joints):
-                joint.set_drive_properties(group.stiffness[i], group.damping[i], force_limit=group.effort[i])
+                joint.set_drive_properties(group.stiffness[i], group.damping[i], force_limit=share * group.effort[i])
                 for part in joint._objs:
                     part.set_armature(np.array([group.armature[i]], np.float32))
 

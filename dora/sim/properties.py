@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs import Actor, Link
 from sapien.physx import get_default_material
 
 
@@ -11,7 +11,7 @@ class ObjectProperties:
     """Sets masses (with inertia in proportion) and friction of one body per environment.
 
     Args:
-        actor: the actor; each of its shapes needs a material of its own.
+        actor: the actor, or a link of an articulation; each of its shapes needs a material of its own.
 
     Attributes:
         nominal: masses as built, one per environment [kg].
@@ -20,7 +20,7 @@ class ObjectProperties:
         ValueError: shapes share a material.
     """
 
-    def __init__(self, actor: Actor):
+    def __init__(self, actor: Actor | Link):
         self.bodies = actor._bodies
         self.nominal = [float(b.mass) for b in self.bodies]
         self._inertia = [np.array(b.inertia) for b in self.bodies]

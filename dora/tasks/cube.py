@@ -11,7 +11,6 @@ import sapien
 import torch
 from jaxtyping import Bool, Float
 from mani_skill.utils.structs import Actor, Pose
-from sapien.physx import PhysxMaterial
 from torch import Tensor
 
 from dora.affordance.bundled_sets import best_candidates
@@ -20,6 +19,7 @@ from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.feasibility_table import Grid
 from dora.geometry.rotations import quaternion_apply, quaternion_multiply
+from dora.sim.actors import build_box
 from dora.sim.cameras import CameraSpec
 from dora.tasks.env.arm import ArmSpec
 from dora.tasks.env.registration import register_task
@@ -29,7 +29,7 @@ from dora.tasks.env.task import HAND_CAMERA, Task
 from dora.tasks.mdp.config import PenaltyWeights, TaskConfig
 from dora.tasks.mdp.mdp import Mdp
 from dora.tasks.mdp.observations import Entry
-from dora.tasks.mdp.quantities import lifted, off_table, opposed, rise, thumb_and_finger, tips_in_object
+from dora.tasks.mdp.quantities import box_distance, lifted, off_table, opposed, rise, thumb_and_finger
 from dora.tasks.mdp.rewards import Term, Terms, tolerance
 from dora.tasks.mdp.snapshot import Snapshot, derived
 from dora.tasks.mdp.stages import Stage
@@ -147,21 +147,8 @@ class CubeTask(Task):
         return Grid(self.config.centre, (self.config.spread,) * 2)
 
     def build(self, scene: TaskScene, name: str, scale: Float[np.ndarray, " n"]) -> Actor:
-        """The cube as a box of uniform density, whose mass and inertia PhysX computes."""
-        cubes = []
-        for i, half in enumerate((float(cube().mesh.extents[0] / 2) * scale).tolist()):
-            builder = scene.scene.create_actor_builder()
-            # A material of its own: without one, every shape of every environment shares SAPIEN's default.
-            material = PhysxMaterial(cube().friction, cube().friction, 0.0)
-            density = cube().mass / (2 * half) ** 3
-            builder.add_box_collision(half_size=(half,) * 3, material=material, density=density)
-            if scene.scene.can_render():
-                paint = sapien.render.RenderMaterial(base_color=list(RED), roughness=0.5)
-                builder.add_box_visual(half_size=(half,) * 3, material=paint)
-            builder.set_scene_idxs([i])
-            builder.initial_pose = Pose.create(sapien.Pose([*self.config.centre, half]))
-            cubes.append(builder.build(f"{name}-{i}"))
-        return scene.merged(cubes, name)
+        """The cube as a box of uniform density."""
+        return build_box(scene.scene, cube(), scale, RED, sapien.Pose([*self.config.centre, cube().support]))
 
     def place(self, scene: TaskScene, rows: Tensor, u: Tensor) -> None:
         """The cube stands on a face, somewhere in the area, at any yaw."""
@@ -172,7 +159,7 @@ class CubeTask(Task):
 OBSERVATIONS: dict[str, Entry] = {
     "half": Entry(lambda s: s.object.half[:, :1], "m", "half edge of the cube"),
     "surface": Entry(
-        lambda s: surface_distance(s), "m", "distance of each fingertip's surface from the cube's", True, region=True
+        lambda s: box_distance(s), "m", "distance of each fingertip's surface from the cube's", True, region=True
     ),
 }
 """What the task observes beyond the common entries."""
@@ -193,16 +180,8 @@ def cube() -> AffordanceObject:
 
 
 @derived
-def surface_distance(s: Snapshot) -> Float[Tensor, "n fingers"]:
-    """Distance of each fingertip's surface from the cube's [m], negative inside (box SDF)."""
-    outside = tips_in_object(s).abs() - s.object.half[:, None]
-    sdf = outside.clamp(min=0).norm(dim=-1) + outside.amax(-1).clamp(max=0)
-    return sdf - s.hand.tip_radius
-
-
-@derived
 def _distance(s: Snapshot) -> Float[Tensor, " n"]:
-    return thumb_and_finger(surface_distance(s))
+    return thumb_and_finger(box_distance(s))
 
 
 @derived
@@ -247,7 +226,7 @@ def terms(c: CubeConfig) -> Terms[Snapshot]:
     return Terms(
         {
             "affordance": Term(
-                lambda s: near_region(surface_distance(s)), w.affordance, "affordance", True,
+                lambda s: near_region(box_distance(s)), w.affordance, "affordance", True,
                 "exp(-alpha * sum of fingertip distances)", region=True,
             ),
             "candidate": Term(

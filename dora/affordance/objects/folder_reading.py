@@ -84,7 +84,9 @@ class _Reader:
         content = read_toml(self.path, "file about an object")
         for key in RESERVED:
             if key in content:
-                raise self.fail(f"{key!r} is reserved for articulated objects, which cannot be loaded yet; remove it.")
+                raise self.fail(
+                    f"{key!r} belongs into articulation.toml, which says what the object is mounted on; move it there."
+                )
         self.keys(content, "object", "the file")
         if content["format"] != FORMAT:
             raise self.fail(f"the format is {shown(content['format'])}, not {FORMAT!r}; write the folder again.")

@@ -31,12 +31,14 @@ class ArmSpec:
         object: name of the object that it handles.
         home: name of the robot's posture at the start of an episode; the object's `start_posture` if None.
         position, quaternion: pose of the robot's base in the world [m], wxyz.
+        robot: name of its folder in `robots/`, unless the environment is made with others.
     """
 
     object: str
     home: str | None = None
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    robot: str = "diana7_hit"
 
 
 def start_posture(spec: ArmSpec) -> str:

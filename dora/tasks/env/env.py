@@ -15,7 +15,7 @@ from gymnasium import spaces
 from jaxtyping import Bool, Float, Int
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
-from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs import Actor, Link
 from mani_skill.utils.structs.types import SimConfig
 from torch import Tensor
 
@@ -37,7 +37,7 @@ from dora.tasks.mdp.guidance_parts import FILTER
 from dora.tasks.mdp.observations import joined, observation_table, observed_part
 from dora.tasks.mdp.rewards import Terms
 from dora.tasks.mdp.snapshot import Snapshot, advanced
-from dora.tasks.mdp.stages import StageMachine
+from dora.tasks.mdp.stages import Stages, make_stages
 
 
 class DoraEnv(BaseEnv):
@@ -53,7 +53,7 @@ class DoraEnv(BaseEnv):
         config: numbers that differ from the task's own, by name (nested for weights and randomisation), or all of
             them as an instance of the task's `CONFIG`.
         grasps: candidates in place of those that come with Dora, of the task's object and robot; one arm only.
-        robot_uids: name of a folder in `robots/`, or a tuple with one for each arm.
+        robot_uids: name of a folder in `robots/`, or a tuple with one for each arm; the task's own by default.
         sim_backend: as in ManiSkill; "auto" on a machine without CUDA is "physx_cpu", or "physx_cpu_batch" for
             num_envs > 1.
         kwargs: everything else that `BaseEnv` takes.
@@ -90,7 +90,7 @@ class DoraEnv(BaseEnv):
         preset: str = "standard",
         config: Any = None,
         grasps: Any = None,
-        robot_uids: Any = "diana7_hit",
+        robot_uids: Any = None,
         num_envs: int = 1,
         control_mode: str | None = None,
         sim_backend: str = "auto",
@@ -101,7 +101,7 @@ class DoraEnv(BaseEnv):
     ):
         options = check_options(
             guidance, guidance_parts, hand_joints, task_config(self.TASK.CONFIG, preset, config), robot_uids,
-            len(self.TASK.ARMS), num_envs, control_mode, sim_backend, render_backend, render_mode, obs_mode,
+            self.TASK.robots(), num_envs, control_mode, sim_backend, render_backend, render_mode, obs_mode,
         )  # fmt: skip
         check_grasps(grasps, tuple(self.TASK.ARMS))
         self.parts, self.config, self._grasps = options.parts, options.config, grasps
@@ -143,17 +143,19 @@ class DoraEnv(BaseEnv):
         poses: Any = [sapien.Pose(arm.position, arm.quaternion) for arm in self.task.ARMS.values()]
         super()._load_agent(options, poses)
         for agent in getattr(self.agent, "agents", [self.agent]):
-            if self.task.WRIST_MOTION is not None and agent.commands_wrist:
-                agent.wrist_controller.set_motion(*self.task.WRIST_MOTION, feed_forward=True)
+            if agent.commands_wrist:
+                agent.wrist_controller.limit_effort(self.config.arm_effort)
+                if self.task.WRIST_MOTION is not None:
+                    agent.wrist_controller.set_motion(*self.task.WRIST_MOTION, feed_forward=True)
 
     def _load_scene(self, options: dict) -> None:
         task, names = self.task, tuple(dict.fromkeys(arm.object for arm in self.task.ARMS.values()))
-        scale = drawn_sizes(self, len(names)) if self._forced_scale is None else self._forced_scale
-        scene = self.task_scene = TaskScene(self.scene, self.num_envs, self.config, scale)
+        scale = drawn_sizes(self, names) if self._forced_scale is None else self._forced_scale
+        scene = self.task_scene = TaskScene(self.scene, self.num_envs, self.config, scale, task.TABLE)
         for k, name in enumerate(names):
             scene.add(name, task.build(scene, name, self.scale[:, k].cpu().numpy()))
         self.mdp = task.make_mdp(scene)
-        self.machine = StageMachine(self.mdp.stages, self.num_envs, self.config.dt, self.device)
+        self.machine: Stages = make_stages(self.mdp.stages, self.num_envs, self.config.dt, self.device)
         terms = self.mdp.paper_terms if self._reward_mode == "paper" else self.mdp.terms
         self.terms: Terms[Any] = terms.in_force(self.parts)
         self.observation_entries = observation_table(tuple(task.ARMS), self.mdp.observations, self.parts)
@@ -175,7 +177,7 @@ class DoraEnv(BaseEnv):
         return self.task_scene.scale
 
     @property
-    def objects(self) -> dict[str, Actor]:
+    def objects(self) -> dict[str, Actor | Link]:
         """The objects by name."""
         return self.task_scene.objects
 
@@ -187,10 +189,11 @@ class DoraEnv(BaseEnv):
     @cached_property
     def segmentation_id_map(self) -> dict[int, Any]:
         """The objects and links by their numbers in pictures of segmentation, which are the same in all rows."""
-        return {**super().segmentation_id_map, **{body._objs[0].per_scene_id: body for body in self.objects.values()}}
+        own = {body._bodies[0].entity.per_scene_id: body for body in self.objects.values()}
+        return {**super().segmentation_id_map, **own}
 
     @property
-    def target_object(self) -> Actor:
+    def target_object(self) -> Actor | Link:
         """The only object; ValueError if there are several."""
         return self.task_scene.object
 
@@ -293,9 +296,9 @@ class DoraEnv(BaseEnv):
         for name, o in s.objects.items():
             self.memory.record_rise(name, o.p[:, 2] - o.start_p[:, 2])
         self.machine.advance(s)
-        stage, phases = self.machine.index.clone(), self.arms.advance(observed)
-        self._snapshot = advanced(s, stage, phases)
-        self._observed = self._snapshot if observed is s else advanced(observed, stage, phases)
+        now = self.machine.index.clone(), self.machine.by_arm(), self.arms.advance(observed)
+        self._snapshot = advanced(s, *now)
+        self._observed = self._snapshot if observed is s else advanced(observed, *now)
         return action
 
     def scripted_action(self) -> Float[Tensor, "n a"]:

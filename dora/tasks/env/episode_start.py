@@ -1,5 +1,6 @@
 """The beginning of episodes: all random numbers are drawn here, and everything gets its first state from them."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -53,10 +54,12 @@ def _sow(env: Any, rows: list[int], seeds: list[int]) -> None:
     env._main_rng, env._episode_rng = env._batched_main_rng[0], env._batched_episode_rng[0]
 
 
-def drawn_sizes(env: Any, objects: int) -> Float[Tensor, "n objects"]:
-    """Sizes of a new scene's objects relative to their nominal ones, one draw from each environment's own stream."""
-    draws = np.asarray(env._batched_episode_rng.uniform(size=(SCALE_DRAW + objects - 1,)))
+def drawn_sizes(env: Any, objects: Sequence[str]) -> Float[Tensor, "n objects"]:
+    """Sizes of a new scene's objects relative to their nominal ones, one draw from each environment's own stream; 1 for
+    objects that the task makes in one size only."""
+    draws = np.asarray(env._batched_episode_rng.uniform(size=(SCALE_DRAW + len(objects) - 1,)))
     share = 2 * draws.reshape(env.num_envs, -1)[:, SCALE_DRAW - 1 :] - 1
+    share[:, [name in env.task.ONE_SIZE for name in objects]] = 0.0
     return torch.tensor(1 + env.config.randomisation.size * share, dtype=torch.float32, device=env.device)
 
 

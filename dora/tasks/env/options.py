@@ -45,7 +45,7 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Any) -> TaskConfig:
         InputError: for an unknown preset, an unknown name, a value of the wrong type, a number that is not finite or
             negative where it is a size, time, speed or count, or rates that do not fit.
     """
-    base: TaskConfig = replace(cls(), randomisation=find_preset(preset))
+    base: TaskConfig = replace(cls(), randomisation=find_preset(preset, cls.PRESETS))
     config = overridden(base, changes or {}, "config")
     check_finite(config, "config")
     check_not_negative(config, "config")
@@ -74,7 +74,7 @@ def check_options(
     hand_joints: int,
     config: TaskConfig,
     robot_uids: Any,
-    arms: int,
+    arms: Sequence[str],
     num_envs: Any,
     control_mode: str | None,
     sim_backend: str,
@@ -120,12 +120,14 @@ def check_grasps(grasps: Any, arms: Sequence[str]) -> None:
         raise InputError(f"grasps are of one arm, and there are {', '.join(arms)}: leave them out")
 
 
-def _robots(robot_uids: Any, arms: int) -> tuple[str, ...]:
-    """Names of the robots of `arms` arms, registered with ManiSkill; one name stands for all."""
-    names = robot_uids if isinstance(robot_uids, tuple | list) else (robot_uids,) * arms
+def _robots(robot_uids: Any, arms: Sequence[str]) -> tuple[str, ...]:
+    """Names of the robots of all arms, registered with ManiSkill; one name stands for all, and None for the task's own,
+    `arms`."""
+    chosen = arms if robot_uids is None else robot_uids
+    names = chosen if isinstance(chosen, tuple | list) else (chosen,) * len(arms)
     known = ", ".join(available_robots())
-    if len(names) != arms:
-        raise InputError(f"robot_uids must name one robot for each of {arms} arms, not {len(names)}")
+    if len(names) != len(arms):
+        raise InputError(f"robot_uids must name one robot for each of {len(arms)} arms, not {len(names)}")
     for name in names:
         if not isinstance(name, str):
             raise InputError(f"robot_uids must be one of {known}, not {name!r}")

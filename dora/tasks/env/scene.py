@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
-from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs import Actor, Link
 from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
 from torch import Tensor
 
@@ -23,7 +23,7 @@ from dora.tasks.env.arm import Arm
 from dora.tasks.env.arm_group import ArmGroup
 from dora.tasks.env.perturbations import Perturbations
 from dora.tasks.env.state_reader import StateReader
-from dora.tasks.env.table import add_table
+from dora.tasks.env.table import TableTop, add_table
 from dora.tasks.env.task import Task
 from dora.tasks.guidance.candidate_choice import CandidateChoice
 from dora.tasks.guidance.guide import Guide
@@ -32,7 +32,7 @@ from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import REGION
 from dora.tasks.mdp.memory import EpisodeMemory, HandSizes
 from dora.tasks.mdp.snapshot import Snapshot
-from dora.tasks.mdp.stages import StageMachine
+from dora.tasks.mdp.stages import Stages
 
 
 class TaskScene:
@@ -43,6 +43,7 @@ class TaskScene:
         num_envs: n.
         config: numbers of the task.
         scale: (n, objects) sizes of the objects relative to their nominal ones.
+        table: its top.
 
     Attributes:
         table: the table, whose upper face is z = 0.
@@ -51,11 +52,18 @@ class TaskScene:
         reader: reads the simulator.
     """
 
-    def __init__(self, scene: ManiSkillScene, num_envs: int, config: TaskConfig, scale: Float[Tensor, "n objects"]):
+    def __init__(
+        self,
+        scene: ManiSkillScene,
+        num_envs: int,
+        config: TaskConfig,
+        scale: Float[Tensor, "n objects"],
+        table: TableTop,
+    ):
         self.scene, self.num_envs, self.config, self.scale = scene, num_envs, config, scale
         self.device = torch.device(scene.device)
-        self.table = add_table(scene)
-        self.objects: dict[str, Actor] = {}
+        self.table = add_table(scene, table)
+        self.objects: dict[str, Actor | Link] = {}
         self.halves: dict[str, Float[Tensor, "n 3"]] = {}
         self._properties: dict[str, ObjectProperties] = {}
         self.arms = ArmGroup()
@@ -80,15 +88,15 @@ class TaskScene:
         self.scene.add_to_state_dict_registry(merged)
         return merged
 
-    def add(self, name: str, actor: Actor) -> None:
-        """Takes a built object in."""
+    def add(self, name: str, actor: Actor | Link) -> None:
+        """Takes a built object in: a body of its own, or a link of what it is mounted on."""
         half = torch.as_tensor(load_object(name).mesh.extents / 2, dtype=torch.float32, device=self.device)
         column = self.scale[:, len(self.objects)]
         self.objects[name], self.halves[name] = actor, half * column[:, None]
         self._properties[name] = ObjectProperties(actor)
 
     @property
-    def object(self) -> Actor:
+    def object(self) -> Actor | Link:
         """The only object; ValueError if there are several."""
         (only,) = self.objects.values()
         return only
@@ -148,7 +156,7 @@ class TaskScene:
         c = self.config
         return Perturbations(c.randomisation, self.num_envs, action_size, hands, c.dt, self.device)
 
-    def snapshot(self, machine: StageMachine, memory: EpisodeMemory, time: Float[Tensor, " n"]) -> Snapshot:
+    def snapshot(self, machine: Stages, memory: EpisodeMemory, time: Float[Tensor, " n"]) -> Snapshot:
         """The state now; arguments as of `StateReader.snapshot`."""
         guides = {name: arm.guide for name, arm in self.arms.items()}
         return self.reader.snapshot(machine, guides, memory, self.halves, time)

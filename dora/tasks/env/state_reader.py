@@ -16,7 +16,7 @@ from dora.sim.robot_agent import DescribedRobot
 from dora.tasks.guidance.guide import Guide
 from dora.tasks.mdp.memory import EpisodeMemory
 from dora.tasks.mdp.snapshot import CONTACT_CLASSES, GoalState, HandState, ObjectState, Snapshot
-from dora.tasks.mdp.stages import StageMachine
+from dora.tasks.mdp.stages import Stages
 
 WORLD = "world"
 """Name of the group of everything else that hands and objects may touch."""
@@ -44,7 +44,7 @@ class StateReader:
         self,
         scene: ManiSkillScene,
         agents: Mapping[str, DescribedRobot],
-        objects: Mapping[str, Actor],
+        objects: Mapping[str, Actor | Link],
         handles: Mapping[str, str],
         world: Sequence[Actor | Link],
         points: int = 0,
@@ -115,7 +115,7 @@ class StateReader:
 
     def snapshot(
         self,
-        machine: StageMachine,
+        machine: Stages,
         guides: Mapping[str, Guide],
         memory: EpisodeMemory,
         halves: Mapping[str, Float[Tensor, "n 3"]],
@@ -148,7 +148,7 @@ class StateReader:
         return Snapshot(
             hands=hands, objects=objects, goals=goals, handles=self._handles,
             penetration=e.penetration.clone(), max_penetration=e.max_penetration.clone(),
-            stage=machine.index.clone(), time=time,
+            stage=machine.index.clone(), stages=machine.by_arm(), time=time,
             action=e.action.clone(), previous_action=e.previous_action.clone(),
         )  # fmt: skip
 

@@ -18,7 +18,7 @@ from dora.sim.cameras import CameraSpec
 from dora.sim.shapes import DrawnShape
 from dora.tasks.env.arm import Arm, ArmSpec
 from dora.tasks.env.starts import STANDING_DRAWS, ChosenStarts, standing_starts
-from dora.tasks.env.table import table_shapes
+from dora.tasks.env.table import TableTop, table_shapes
 from dora.tasks.guidance.grasp_and_lift import GraspReference
 from dora.tasks.guidance.reference import Reference
 from dora.tasks.mdp.config import TaskConfig
@@ -61,6 +61,10 @@ class Task(ABC):
     """Whether contacts are collected from all physics steps of a control step: blows are shorter than that."""
     WRIST_MOTION: ClassVar[tuple[float, float] | None] = None
     """Wrist speed [m/s] and spin [rad/s] of a full action, told to the drives as well; the controller's own if None."""
+    ONE_SIZE: ClassVar[frozenset[str]] = frozenset()
+    """Names of the objects whose size is not drawn."""
+    TABLE: ClassVar[TableTop] = TableTop()
+    """The table."""
     CAMERA: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]]] = (
         (1.05, 0.62, 0.48),
         (0.42, 0.02, 0.2),
@@ -71,6 +75,11 @@ class Task(ABC):
 
     def __init__(self, config: Any):
         self.config = config
+
+    @classmethod
+    def robots(cls) -> list[str]:
+        """Names of the robots of all arms, unless an environment is made with others."""
+        return [arm.robot for arm in cls.ARMS.values()]
 
     @abstractmethod
     def make_mdp(self, scene: "TaskScene") -> Mdp[Any]:
@@ -98,7 +107,7 @@ class Task(ABC):
         """The same grasps as an arm executes them in this task."""
         return candidates
 
-    def build(self, scene: "TaskScene", name: str, scale: Float[np.ndarray, " n"]) -> Actor:
+    def build(self, scene: "TaskScene", name: str, scale: Float[np.ndarray, " n"]) -> Actor | Link:
         """Builds an object into every sub-scene, `scale` times its size; the folder of that name by default."""
         return scene.build(name, scale)
 
@@ -122,7 +131,7 @@ class Task(ABC):
 
     def drawn(self, scene: "TaskScene") -> Mapping[str, tuple[Actor | Link, tuple[DrawnShape, ...]]]:
         """What a page draws besides robots and objects: bodies by name, with their shapes."""
-        return {"table": (scene.table, table_shapes())}
+        return {"table": (scene.table, table_shapes(self.TABLE))}
 
     def masses(self, name: str, nominal: Float[Tensor, " b"], u: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
         """Masses of new episodes [kg] from an object's nominal ones and uniform random numbers."""

@@ -1,8 +1,10 @@
 """The numbers of a task as a frozen dataclass: weights, thresholds, randomisation, rates; overridden by name."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
-from dora.tasks.mdp.randomisation import Randomisation
+from dora.tasks.mdp.randomisation import PRESETS, Randomisation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,6 +23,9 @@ class ResidualBounds:
 class TaskConfig:
     """Numbers that every task has; a task adds its own fields."""
 
+    PRESETS: ClassVar[Mapping[str, Randomisation]] = PRESETS
+    """The named presets of the randomisation."""
+
     control_frequency: int = 20
     """Control steps per second [Hz]."""
     physics_frequency: int = 100
@@ -33,6 +38,8 @@ class TaskConfig:
     """Distance at which PhysX begins to see a contact of a body without its own setting [m]."""
     penetration_limit: float = 0.005
     """Largest overlap in an episode that counts as a success [m]."""
+    arm_effort: float = 1.0
+    """Share of their torque limits with which the drives of an arm work [1]."""
     residual: ResidualBounds = field(default_factory=ResidualBounds)
     """Bounds of the residual action."""
     randomisation: Randomisation = field(default_factory=Randomisation)

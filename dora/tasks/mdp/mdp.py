@@ -34,7 +34,7 @@ class Mdp(Generic[S]):
     """What a task asks for; everything is a pure function of a snapshot and of what the episode remembers.
 
     Attributes:
-        stages: the sub-tasks, in order.
+        stages: the sub-tasks, in order; or those of each arm, by its name, which are done side by side.
         terms: the reward's terms.
         paper_terms: the printed reward, corrected (`reward_mode="paper"`).
         penetration_limit: largest overlap in an episode that counts as a success [m].
@@ -43,7 +43,7 @@ class Mdp(Generic[S]):
         failure: what has happened then, in words.
     """
 
-    stages: Sequence[Stage[Any]]
+    stages: Sequence[Stage[Any]] | Mapping[str, Sequence[Stage[Any]]]
     terms: Terms[Any]
     paper_terms: Terms[Any]
     penetration_limit: float
@@ -65,10 +65,13 @@ class Mdp(Generic[S]):
         Returns:
             `fail`: nothing can mend the episode, such as that of a jug that is dropped again. `raw_success`: finished
             and not failed. `success`: besides, no overlap of the episode was above the limit. `success_at_end`:
-            besides, this very state passes the test of the last stage, without its hold.
+            besides, this very state passes the test of the last stage (of every arm), without its hold.
         """
         failed = self.failed(s, memory) | unreachable
         raw = finished & ~failed
         success = raw & (memory.max_penetration <= self.penetration_limit)
-        now = success & self.stages[-1].done(s)
+        if isinstance(self.stages, Mapping):
+            now = success & torch.stack([ladder[-1].done(s.of(arm)) for arm, ladder in self.stages.items()]).all(0)
+        else:
+            now = success & self.stages[-1].done(s)
         return {"success": success, "raw_success": raw, "success_at_end": now, "fail": failed}

@@ -107,6 +107,10 @@ def _tips(s: Snapshot) -> Tensor:
     return quaternion_apply(quaternion_inverse(q), s.hand.tip_p.flatten(0, 1) - p).reshape(n, 3 * fingers)
 
 
+def _stage(s: Snapshot) -> Tensor:
+    return torch.stack([*s.stages.values()] or [s.stage], -1).float()
+
+
 def _tip_directions(s: Snapshot) -> Tensor:
     return matrix_from_quaternion(s.hand.tip_q)[..., 2].flatten(-2)
 
@@ -137,7 +141,7 @@ ARM_ENTRIES: dict[str, Entry] = {
     "max_penetration": Entry(
         lambda s: s.max_penetration[:, None] * 1000, "mm", "largest overlap of the episode so far"
     ),
-    "stage": Entry(lambda s: s.stage[:, None].float(), "1", "index of the active stage"),
+    "stage": Entry(_stage, "1", "index of the active stage, of each arm if they have stages of their own"),
     "time": Entry(lambda s: s.time[:, None], "1", "share of the episode that is over", sensed=True),
     "goal": Entry(
         lambda s: torch.cat(goal_error(s), -1), "m, rad", "wrist to candidate: position and rotation vector", True

@@ -31,6 +31,14 @@ def tips_in_object(s: Snapshot) -> Float[Tensor, "n fingers 3"]:
 
 
 @derived
+def box_distance(s: Snapshot) -> Float[Tensor, "n fingers"]:
+    """Distance of each fingertip's surface from a box-shaped object's [m], negative inside (box SDF)."""
+    outside = tips_in_object(s).abs() - s.object.half[:, None]
+    sdf = outside.clamp(min=0).norm(dim=-1) + outside.amax(-1).clamp(max=0)
+    return sdf - s.hand.tip_radius
+
+
+@derived
 def goal_error(s: Snapshot) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Position [m] and rotation vector [rad] from the wrist to the candidate's goal, in the hand-base frame."""
     turn = quaternion_multiply(quaternion_inverse(s.hand.wrist_q), s.goal.q)

@@ -1,6 +1,7 @@
 """How much an episode is randomised and perturbed: named presets, the same for every task."""
 
 import difflib
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from dora.errors import InputError
@@ -69,13 +70,13 @@ PRESETS: dict[str, Randomisation] = {
         push_rate=0.5,
     ),
 }
-"""The named presets; the same for every task."""
+"""The named presets; a task with more to draw has its own, with the same numbers of these."""
 
 
-def find_preset(name: str) -> Randomisation:
-    """The preset called `name`; raises InputError for an unknown one."""
-    if name not in PRESETS:
-        near = difflib.get_close_matches(str(name), PRESETS, 1)
+def find_preset(name: str, presets: Mapping[str, Randomisation] = PRESETS) -> Randomisation:
+    """The preset called `name` among a task's; raises InputError for an unknown one."""
+    if name not in presets:
+        near = difflib.get_close_matches(str(name), presets, 1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise InputError(f"unknown preset {name!r}{hint} (choose one of {', '.join(PRESETS)})")
-    return PRESETS[name]
+        raise InputError(f"unknown preset {name!r}{hint} (choose one of {', '.join(presets)})")
+    return presets[name]

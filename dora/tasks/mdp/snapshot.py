@@ -19,6 +19,8 @@ CONTACT_CLASSES = ("none", "palm", *FINGERS)
 """Names of the values of `HandState.contact_finger`."""
 DERIVED, FROM_CONTACTS = "_derived", "_from_contacts"
 """Where a snapshot keeps what `derived` and `derived_from_contacts` functions have computed."""
+VIEWS, FORMER = "_views", "_former_views"
+"""Where it keeps what its arms see, and what they saw in the snapshot from which it was made, with what is shared."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,9 @@ class Snapshot:
         handles: name of the object that each arm handles.
         penetration: largest overlap of hand and object, or of either with the world, now [m].
         max_penetration: the same, maximum over the episode [m].
-        stage: index of the active stage; the number of stages when all are done.
+        stage: index of the active stage; the number of stages when all are done. Where arms have stages of their own,
+            the number of those that are done, of all arms.
+        stages: index of the active stage of each arm that has stages of its own, by its name.
         time: share of the episode that is over, 0 to 1.
         action, previous_action: last two actions, as given.
     """
@@ -126,6 +130,7 @@ class Snapshot:
     penetration: Float[Tensor, " n"]
     max_penetration: Float[Tensor, " n"]
     stage: Int[Tensor, " n"]
+    stages: Mapping[str, Int[Tensor, " n"]]
     time: Float[Tensor, " n"]
     action: Float[Tensor, "n a"]
     previous_action: Float[Tensor, "n a"]
@@ -146,20 +151,27 @@ class Snapshot:
         return _only(self.goals, "goals")
 
     def of(self: "S", arm: str) -> "S":
-        """The same state as one arm sees it: its hand, the object that it handles, its goal; made once."""
+        """The same state as one arm sees it: its hand, the object that it handles, its goal, its stage; made once."""
         if len(self.hands) == len(self.objects) == 1:
             return self
-        views = self.__dict__.setdefault("_views", {})
+        views = self.__dict__.setdefault(VIEWS, {})
         if arm not in views:
             name = self.handles[arm]
-            views[arm] = replace(
+            view = replace(
                 self,
                 hands={arm: self.hands[arm]},
                 objects={name: self.objects[name]},
                 goals={arm: self.goals[arm]},
                 handles={arm: name},
+                stage=self.stages.get(arm, self.stage),
             )
+            former, shared = self.__dict__.get(FORMER, ({}, ()))
+            views[arm] = _sharing(former[arm], view, *shared) if arm in former else view
         return views[arm]
+
+    def reobserved(self: "S") -> "S":
+        """The same with what a task derives from poses in `extended`, after noise was added to them; itself here."""
+        return self
 
 
 def _only(records: Mapping[str, Record], what: str) -> Record:
@@ -205,20 +217,21 @@ def extended(s: Snapshot, kind: type[S], **more: Any) -> S:
     return kind(**own, **more)
 
 
-def advanced(s: S, stage: Tensor, phases: Mapping[str, Tensor]) -> S:
-    """The snapshot with another stage and other phases of the references (by arm); what was derived stays."""
+def advanced(s: S, stage: Tensor, stages: Mapping[str, Tensor], phases: Mapping[str, Tensor]) -> S:
+    """The snapshot with other stages and other phases of the references (by arm); what was derived stays."""
     goals = {arm: replace(goal, phase=phases[arm]) for arm, goal in s.goals.items()}
-    return _sharing(s, replace(s, stage=stage, goals=goals), DERIVED, FROM_CONTACTS)
+    return _sharing(s, replace(s, stage=stage, stages=stages, goals=goals), DERIVED, FROM_CONTACTS)
 
 
 def observed(
     s: S, hands: Mapping[str, HandState], objects: Mapping[str, ObjectState], goals: Mapping[str, GoalState]
 ) -> S:
     """The snapshot with noise in poses and joints; what was derived from contacts alone stays."""
-    return _sharing(s, replace(s, hands=hands, objects=objects, goals=goals), FROM_CONTACTS)
+    return _sharing(s, replace(s, hands=hands, objects=objects, goals=goals).reobserved(), FROM_CONTACTS)
 
 
 def _sharing(old: S, new: S, *places: str) -> S:
     for place in places:
         new.__dict__[place] = old.__dict__.setdefault(place, {})
+    new.__dict__[FORMER] = old.__dict__.get(VIEWS, {}), places
     return new

@@ -1,8 +1,8 @@
-"""Batched stage machine: every environment walks the same table of sub-tasks at its own pace."""
+"""Batched stage machines: every environment walks the same table of sub-tasks at its own pace, each arm its own."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -97,7 +97,97 @@ class StageMachine(Generic[S]):
         """(N,) bool: all stages done."""
         return self.index == len(self)
 
+    def by_arm(self) -> dict[str, Tensor]:
+        """Active stages by arm, of which this machine knows none."""
+        return {}
+
     def report(self) -> dict[str, Tensor]:
         """(N,) tensors for `info`: whether all stages are done, the active one, and which were completed so far."""
         done = {f"stage/{stage.name}": self.furthest > k for k, stage in enumerate(self.stages)}
         return {"finished": self.finished, "stage": self.index.clone(), **done}
+
+
+class ParallelStages:
+    """One machine per arm, side by side: no arm's stages wait for another's, unless their tests say so.
+
+    All is finished when every machine is at the same time. Names of stages are unique over all arms.
+
+    Args:
+        ladders: stages by arm, in order; their functions look at what that arm sees of the snapshot.
+        num_envs, dt, device: as of `StageMachine`.
+    """
+
+    def __init__(
+        self, ladders: Mapping[str, Sequence[Stage[Any]]], num_envs: int, dt: float, device: torch.device | str = "cpu"
+    ):
+        self.machines = {arm: StageMachine(stages, num_envs, dt, device) for arm, stages in ladders.items()}
+        names = [stage.name for stage in self.stages]
+        if len(set(names)) != len(names):
+            raise ValueError(f"stage names repeat: {names}")
+
+    @property
+    def stages(self) -> tuple[Stage[Any], ...]:
+        """The stages of all arms."""
+        return tuple(stage for machine in self.machines.values() for stage in machine.stages)
+
+    def __len__(self) -> int:
+        return len(self.stages)
+
+    @property
+    def index(self) -> Tensor:
+        """(N,) number of stages that are done now, of all arms."""
+        return torch.stack([machine.index for machine in self.machines.values()]).sum(0)
+
+    @property
+    def furthest(self) -> Tensor:
+        """(N,) the same, of those that have been done so far."""
+        return torch.stack([machine.furthest for machine in self.machines.values()]).sum(0)
+
+    @property
+    def finished(self) -> Tensor:
+        """(N,) bool: all stages of all arms done."""
+        return torch.stack([machine.finished for machine in self.machines.values()]).all(0)
+
+    def by_arm(self) -> dict[str, Tensor]:
+        """(N,) index of the active stage of each arm; the number of its stages when all are done."""
+        return {arm: machine.index.clone() for arm, machine in self.machines.items()}
+
+    def reset(self, env_idx: Tensor) -> None:
+        """As `StageMachine.reset`, for all arms."""
+        for machine in self.machines.values():
+            machine.reset(env_idx)
+
+    def advance(self, s: Any) -> None:
+        """Moves every arm of every environment at most one stage. Call exactly once per control step."""
+        for arm, machine in self.machines.items():
+            machine.advance(s.of(arm))
+
+    def get_state(self) -> dict[str, Tensor]:
+        """The buffers (N,) of all machines, by arm and name."""
+        return {f"{arm}.{k}": v for arm, machine in self.machines.items() for k, v in machine.get_state().items()}
+
+    def set_state(self, state: dict[str, Tensor], env_idx: Tensor | slice) -> None:
+        """Inverse of `get_state` for the rows `env_idx`."""
+        for arm, machine in self.machines.items():
+            own = {name: state[f"{arm}.{name}"] for name in machine.get_state()}
+            machine.set_state(own, env_idx)
+
+    def report(self) -> dict[str, Tensor]:
+        """(N,) tensors for `info`, as `StageMachine.report`."""
+        done = {name: v for m in self.machines.values() for name, v in m.report().items() if name.startswith("stage/")}
+        return {"finished": self.finished, "stage": self.index, **done}
+
+
+Stages = StageMachine[Any] | ParallelStages
+"""What walks a task's stages."""
+
+
+def make_stages(
+    stages: Sequence[Stage[Any]] | Mapping[str, Sequence[Stage[Any]]],
+    num_envs: int,
+    dt: float,
+    device: torch.device | str = "cpu",
+) -> Stages:
+    """The machine of one ladder of stages, or of one ladder for each arm."""
+    kind = ParallelStages if isinstance(stages, Mapping) else StageMachine
+    return kind(stages, num_envs, dt, device)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,146 @@
+"""What the microwave task reads in addition, and the quantities that its stages, terms and observations share.
+
+The microwave's frame: origin in its front plane at the bottom, +x into the cavity, +z up; the door's hinge is at +y.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dora.geometry.rotations import (
+    quaternion_apply,
+    quaternion_inverse,
+    quaternion_multiply,
+    rotation_vector_from_quaternion,
+)
+from dora.tasks.mdp.quantities import box_distance, in_wrist, thumb_and_finger, tips_in_object, turned_in_wrist
+from dora.tasks.mdp.snapshot import Snapshot, derived
+
+LEFT, RIGHT = "left", "right"
+"""Names of the arms: the left one opens the door, the right one puts the cube inside."""
+CAVITY = ((0.02, 0.32), (-0.18, 0.18), (0.02, 0.28))
+"""The space inside, from the front edge of its floor to the back wall, in the microwave's frame [m]."""
+
+
+@dataclass(frozen=True)
+class MicrowaveSnapshot(Snapshot):
+    """A snapshot with the microwave.
+
+    Attributes:
+        oven_p, oven_q: pose of its frame in the world [m], wxyz.
+        door: angle of the door [rad], 0 when it is shut; as observed, from the observed pose of the handle.
+        door_speed: [rad/s].
+        wrists: positions of all wrists [m], world frame, in the order of the arms.
+        tips_of_placer: positions of the right hand's fingertips [m], world frame.
+        cube_p: centre of the cube [m], world frame.
+        bar: ends of the axis of the handle's bar in the handle's frame, (2, 3) [m].
+        bar_radius: [m].
+        shut_q: orientation of the handle in the microwave's frame when the door is shut, wxyz (4,).
+    """
+
+    oven_p: Float[Tensor, "n 3"]
+    oven_q: Float[Tensor, "n 4"]
+    door: Float[Tensor, " n"]
+    door_speed: Float[Tensor, " n"]
+    wrists: Float[Tensor, "n arms 3"]
+    tips_of_placer: Float[Tensor, "n fingers 3"]
+    cube_p: Float[Tensor, "n 3"]
+    bar: Float[Tensor, "2 3"]
+    bar_radius: float
+    shut_q: Float[Tensor, " 4"]
+
+    def reobserved(self) -> "MicrowaveSnapshot":
+        """The same with door and cube as the noisy poses of handle and cube tell."""
+        shut = quaternion_multiply(self.oven_q, self.shut_q.expand_as(self.oven_q))
+        turned = quaternion_multiply(quaternion_inverse(self.oven_q), _turn(shut, self.objects["microwave"].q))
+        turned = quaternion_multiply(turned, self.oven_q)
+        angle = -rotation_vector_from_quaternion(turned)[:, 2]  # the door opens against +z
+        return replace(self, door=angle, cube_p=self.objects["cube"].p)
+
+
+def _turn(a: Tensor, b: Tensor) -> Tensor:
+    """Rotation in the world that takes orientation a to b."""
+    return quaternion_multiply(b, quaternion_inverse(a))
+
+
+def in_oven(s: MicrowaveSnapshot, point: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """World point -> microwave's frame [m]."""
+    return quaternion_apply(quaternion_inverse(s.oven_q), point - s.oven_p)
+
+
+@derived
+def cube_in_oven(s: MicrowaveSnapshot) -> Float[Tensor, "n 3"]:
+    """Centre of the cube in the microwave's frame [m]."""
+    return in_oven(s, s.cube_p)
+
+
+@derived
+def inside(s: MicrowaveSnapshot) -> Bool[Tensor, " n"]:
+    """The centre of the cube, as the right arm sees it, is so far inside that the cube's front edge is, too."""
+    margin = s.object.half.amax(-1)
+    p = cube_in_oven(s)
+    (x0, x1), (y0, y1), (z0, z1) = CAVITY
+    across = (p[:, 1] > y0) & (p[:, 1] < y1) & (p[:, 2] > z0) & (p[:, 2] < z1)
+    return (p[:, 0] > x0 + margin) & (p[:, 0] < x1) & across
+
+
+@derived
+def hand_out(s: MicrowaveSnapshot) -> Bool[Tensor, " n"]:
+    """No part of the right hand that is looked at (wrist, fingertips) is behind the front plane."""
+    points = torch.cat([s.tips_of_placer, s.wrists[:, -1:]], 1)
+    q = quaternion_inverse(s.oven_q)[:, None].expand(-1, points.shape[1], -1)
+    return quaternion_apply(q, points - s.oven_p[:, None])[..., 0].amax(-1) < 0.0
+
+
+@derived
+def handle_distance(s: MicrowaveSnapshot) -> Float[Tensor, "n fingers"]:
+    """Distance of each of the left hand's fingertips from the surface of the handle's bar [m], negative inside."""
+    tips = tips_in_object(s)
+    start, along = s.bar[0], s.bar[1] - s.bar[0]
+    share = (((tips - start) * along).sum(-1) / along.square().sum()).clamp(0, 1)
+    away = (tips - start - share[..., None] * along).norm(dim=-1)
+    return away - s.bar_radius - s.hand.tip_radius
+
+
+def is_left(s: Snapshot) -> bool:
+    """Whether a snapshot is what the left arm sees."""
+    return LEFT in s.hands
+
+
+@derived
+def region_distance(s: MicrowaveSnapshot) -> Float[Tensor, "n fingers"]:
+    """Distance of an arm's fingertips from what it is to hold: the handle, or the cube [m]."""
+    return handle_distance(s) if is_left(s) else box_distance(s)
+
+
+@derived
+def to_region(s: MicrowaveSnapshot) -> Float[Tensor, " n"]:
+    """Distance of thumb and one more fingertip from what the arm is to hold [m]."""
+    return thumb_and_finger(region_distance(s))
+
+
+@derived
+def oven_in_hand(s: MicrowaveSnapshot) -> Float[Tensor, "n 3"]:
+    """Origin of the microwave's frame in the hand frame [m]."""
+    return in_wrist(s, s.oven_p)
+
+
+@derived
+def into_oven_in_hand(s: MicrowaveSnapshot) -> Float[Tensor, "n 3"]:
+    """Direction into the cavity in the hand frame [1]."""
+    ahead = torch.tensor([1.0, 0.0, 0.0], device=s.oven_q.device).expand_as(s.oven_p)
+    return turned_in_wrist(s, quaternion_apply(s.oven_q, ahead))
+
+
+@derived
+def object_in_oven(s: MicrowaveSnapshot) -> Float[Tensor, "n 3"]:
+    """What the arm handles, the handle or the cube, in the microwave's frame [m]."""
+    return in_oven(s, s.object.p)
+
+
+@derived
+def other_wrist_in_hand(s: MicrowaveSnapshot) -> Float[Tensor, "n 3"]:
+    """The other arm's wrist in the hand frame [m]."""
+    return in_wrist(s, s.wrists[:, 1 if is_left(s) else 0])

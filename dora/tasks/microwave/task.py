@@ -1,0 +1,188 @@
+"""DoraMicrowave-v1: what is built, how episodes start, and what leads the two arms."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any, ClassVar
+
+import numpy as np
+import sapien
+import torch
+from jaxtyping import Float
+from mani_skill.utils.structs import Actor, Link, Pose
+from torch import Tensor
+
+from dora.affordance.bundled_sets import best_candidates
+from dora.affordance.candidates import GraspCandidates
+from dora.affordance.objects.articulation import load_mount
+from dora.affordance.objects.catalogue import load_object
+from dora.affordance.reach.feasibility_table import Grid
+from dora.geometry.rotations import quaternion_from_rotation_vector
+from dora.robot import RobotDescription
+from dora.sim.actors import build_box
+from dora.sim.cameras import CameraSpec
+from dora.sim.hinged import HingedObject, drawn_mount
+from dora.sim.shapes import DrawnShape
+from dora.tasks.env.arm import ArmSpec
+from dora.tasks.env.registration import register_task
+from dora.tasks.env.scene import TaskScene
+from dora.tasks.env.starts import STANDING_DRAWS, standing
+from dora.tasks.env.table import TableTop
+from dora.tasks.env.task import HAND_CAMERA, Task
+from dora.tasks.guidance.reference import Reference
+from dora.tasks.guidance.waypoints import WaypointReference
+from dora.tasks.mdp.mdp import Mdp
+from dora.tasks.mdp.snapshot import Snapshot, extended
+from dora.tasks.microwave.mdp import OBSERVATIONS, MicrowaveConfig, failed, paper_terms, stages, terms
+from dora.tasks.microwave.reference import opening, placing
+from dora.tasks.microwave.snapshot import CAVITY, LEFT, RIGHT, MicrowaveSnapshot
+
+OVEN_DRAWS = 6
+"""Random numbers of a microwave: x, y, yaw, damping, friction, latch."""
+BLUE = (0.20, 0.42, 0.75, 1.0)
+"""Colour of the cube: red, green, blue and opacity [1]."""
+CLASSES = {LEFT: "HandleGrasp", RIGHT: "BodyGrasp"}
+"""The grasp classes of the candidates of each arm."""
+
+
+@register_task("DoraMicrowave-v1")
+class MicrowaveTask(Task):
+    """Open a microwave by its handle with the left arm, and put a cube inside with the right one.
+
+    **Randomisations:** the cube's position within +-6 cm and its yaw, wherever the right arm can carry out at least one
+    stored candidate; place (+-4 cm) and yaw (+-10 degrees) of the microwave, damping, friction and latch of its door;
+    size, mass and friction of the cube, friction of the handle, candidate error and observation noise by preset.
+
+    **Stages**, side by side. Left: reach_handle (thumb and one fingertip within 3 cm of the handle), grasp_handle
+    (thumb and one more finger touch it for 0.15 s), open (60 degrees). Right: reach_cube and grasp_cube (the same with
+    the cube), carry (8 cm above its start and before the cavity), put_in (the whole cube is behind the front plane),
+    leave (the cube lies inside, nobody touches it, and wrist and fingertips are out, for 0.25 s).
+
+    **Success:** all stages done, and no overlap above 5 mm in the whole episode, of hands, arms, door, body or cube.
+
+    **Failure:** the cube falls off the table or is knocked away.
+    """
+
+    CONFIG = MicrowaveConfig
+    ARMS: ClassVar[Mapping[str, ArmSpec]] = {
+        LEFT: ArmSpec("microwave", "above", (0.0, 0.35, 0.0), robot="diana7_hit_left"),
+        RIGHT: ArmSpec("cube", "above", (0.0, -0.35, 0.0)),
+    }
+    DRAWS = STANDING_DRAWS + OVEN_DRAWS
+    MAX_STEPS = 340
+    ONE_SIZE: ClassVar[frozenset[str]] = frozenset({"microwave"})
+    TABLE: ClassVar[TableTop] = TableTop((0.45, 0.0), (0.80, 0.75, 0.02))
+    CAMERA = ((-0.55, -1.05, 1.15), (0.52, -0.02, 0.20))
+    CAMERAS: ClassVar[Mapping[str, CameraSpec]] = {
+        "hand_camera": HAND_CAMERA,
+        "front_camera": CameraSpec(eye=(-0.25, -0.75, 0.85), target=(0.6, -0.05, 0.2), fov=1.0),
+    }
+    LEARNERS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "ppo": {
+            "total_steps": 600_000, "stop_success": 0.97, "num_envs": 64, "eval_every": 150_000, "eval_episodes": 50,
+            "eval_envs": 50, "learner": {"rollout": 32, "log_std": -1.8},
+        },
+    }  # fmt: skip
+
+    oven: HingedObject
+
+    def make_mdp(self, scene: TaskScene) -> Mdp[MicrowaveSnapshot]:
+        c: MicrowaveConfig = self.config
+        judged = stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS, failed
+        return Mdp(*judged, "the cube has left the table or the reach of the arm")
+
+    def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
+        c: MicrowaveConfig = self.config
+        return best_candidates(self.ARMS[arm].object, CLASSES[arm], c.fewest, c.most_candidates, region)
+
+    def adapted(self, candidates: GraspCandidates, arm: str, robot: RobotDescription) -> GraspCandidates:
+        """The left hand is the mirror image of the right one, for which the candidates were found."""
+        return mirrored(candidates) if arm == LEFT else candidates
+
+    def make_reference(self, scene: TaskScene, arm: str) -> Reference:
+        c: MicrowaveConfig = self.config
+        if arm == LEFT:
+            hinge = torch.tensor(oven_mount().hinge_link.position, device=scene.device)
+            way, closing_time = opening(c.opening, hinge), c.opening.closing_time
+        else:
+            way, closing_time = placing(c.placing, CAVITY[2][0]), c.placing.closing_time
+        return WaypointReference(way, scene.num_envs, c.dt, scene.device, closing_time)
+
+    def start_grid(self, arm: str) -> Grid | None:
+        return Grid(self.config.centre, (self.config.spread,) * 2) if arm == RIGHT else None
+
+    def build(self, scene: TaskScene, name: str, scale: Float[np.ndarray, " n"]) -> Actor | Link:
+        """The microwave around its handle, and the cube."""
+        obj = load_object(name)
+        if name == "cube":
+            return build_box(scene.scene, obj, scale, BLUE, sapien.Pose([*self.config.centre, obj.support]))
+        self.oven = HingedObject(scene.scene, obj, oven_mount())
+        bar = next(p.shape for p in obj.pieces if p.label == obj.target)
+        self._bar = torch.tensor(np.asarray(bar.segment), dtype=torch.float32, device=scene.device)
+        self._bar_radius = float(bar.size[0])
+        return self.oven.link
+
+    def world(self, scene: TaskScene) -> Sequence[Actor | Link]:
+        return [scene.table, *(link for link in self.oven.links.values() if link is not self.oven.link)]
+
+    def place(self, scene: TaskScene, rows: Tensor, u: Tensor) -> None:
+        """The microwave is shut and stands somewhere near its place; the cube stands somewhere in its area."""
+        c: MicrowaveConfig = self.config
+        r, hinge = c.randomisation, oven_mount().hinge
+        cube, oven = u.split([STANDING_DRAWS, OVEN_DRAWS], -1)
+        oven = 2 * oven - 1
+        position = torch.tensor(c.oven, device=scene.device).repeat(len(rows), 1)
+        position[:, :2] += r.oven_position * oven[:, :2]
+        turn = torch.zeros_like(position)
+        turn[:, 2] = r.oven_rotation * oven[:, 2]
+        resistance = torch.tensor([hinge.damping, hinge.friction, hinge.latch], device=scene.device)
+        damping, friction, latch = (resistance * (1 + r.hinge * oven[:, 3:])).unbind(-1)
+        self.oven.begin(rows, position, quaternion_from_rotation_vector(turn), damping, friction, latch)
+        grid = self.start_grid(RIGHT)
+        assert grid is not None
+        reachable = partial(self.startable, scene.arms[RIGHT])
+        actor = scene.objects["cube"]
+        assert isinstance(actor, Actor)
+        actor.set_pose(Pose.create_from_pq(*standing(cube, scene.halves["cube"][rows, 2], grid, reachable)))
+
+    def masses(self, name: str, nominal: Float[Tensor, " b"], u: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
+        return nominal if name == "microwave" else super().masses(name, nominal, u)
+
+    def drawn(self, scene: TaskScene) -> Mapping[str, tuple[Actor | Link, tuple[DrawnShape, ...]]]:
+        """The table and the links of the microwave."""
+        shapes = drawn_mount(load_object("microwave"), oven_mount())
+        return {**super().drawn(scene), **{name: (link, shapes[name]) for name, link in self.oven.links.items()}}
+
+    def extended(self, s: Snapshot) -> MicrowaveSnapshot:
+        """The snapshot with the microwave and its door."""
+        body = self.oven.links[oven_mount().links[0].name].pose
+        shut = torch.tensor(oven_mount().object_link.quaternion, device=body.q.device)
+        return extended(
+            s, MicrowaveSnapshot, oven_p=body.p, oven_q=body.q, door=self.oven.angle, door_speed=self.oven.speed,
+            wrists=torch.stack([hand.wrist_p for hand in s.hands.values()], 1),
+            tips_of_placer=s.hands[RIGHT].tip_p, cube_p=s.objects["cube"].p,
+            bar=self._bar, bar_radius=self._bar_radius, shut_q=shut,
+        )  # fmt: skip
+
+    def stateful(self) -> dict[str, Any]:
+        return {"oven": self.oven}
+
+
+@cache
+def oven_mount() -> Any:
+    """What the handle is mounted on."""
+    return load_mount(load_object("microwave"))
+
+
+def mirrored(candidates: GraspCandidates) -> GraspCandidates:
+    """The candidates of a hand as those of its mirror image, for an object that is its own mirror image about the plane
+    y = 0 of its frame: positions (x, -y, z), quaternions (w, -x, y, -z), the joints unchanged."""
+    flip = torch.tensor([1.0, -1.0, 1.0])
+    turn = torch.tensor([1.0, -1.0, 1.0, -1.0])
+    return replace(
+        candidates,
+        position=candidates.position * flip,
+        quaternion=candidates.quaternion * turn,
+        approach=candidates.approach * flip,
+        contacts=candidates.contacts * flip,
+    )
