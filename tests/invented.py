@@ -68,6 +68,7 @@ def invented(n: int, **given: Tensor) -> Snapshot:
         "objects": {"thing": record(ObjectState, OBJECT_SHAPES, n, body)},
         "goals": {"arm": record(GoalState, GOAL_SHAPES, n, goal)},
         "handles": {"arm": "thing"},
+        "stages": {},
     }
     return record(Snapshot, SHARED_SHAPES, n, records | shared)
 

@@ -84,7 +84,8 @@ class LiveTask:
             recorded = player.recording.episode(beginning.seed % len(player.recording.names))
         self._make(player.options_with(beginning.preset))
         self.beginning, self._recorded, env = beginning, recorded, self.env
-        env.chosen_start, env.narrow = self._placed, None if beginning.candidate is None else self._only
+        env.chosen_start = self._placed
+        env.narrow = {} if beginning.candidate is None else {env.arm.name: self._only}
         self._observation = self._first_observation(recorded)
         if self._read is not env.task_scene:
             self.reader, self._read = Reader(env), env.task_scene

@@ -96,7 +96,7 @@ def outcomes(env_id: str, episodes: int, preset: str, choice: Choice) -> Outcome
     task = make_task(env_id, BATCH, preset=preset, guidance_parts=parts)
     if task.arm.reach_table is None:
         raise InputError(f"{env_id} has no table of f_reach: its object does not stand on a table.")
-    task.narrow = _Drawn(task) if choice == "random" else None
+    task.narrow = {task.arm.name: _Drawn(task)} if choice == "random" else {}
     reasons, won = [], []
     with ProgressDisplay() as phases:
         report, batches = phases.phase(f"{choice} candidates", "episodes"), -(-episodes // BATCH)

@@ -7,7 +7,7 @@ grasps that it reaches penetrate the object too deep when it is lifted. Episodes
 import itertools
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from dora.errors import InputError
 from dora.parallel import run_cases
 from dora.tasks import find_task, make_task, task_ids
 from dora.tasks.env.env import DoraEnv
+from dora.tasks.mdp.stages import ParallelStages
 
 FIRST_TRIES, MORE_TRIES = 6, 30
 """Episodes per grasp when a bundled set is ranked: of all grasps, then of the better ones."""
@@ -82,20 +83,30 @@ class _Balanced:
         return only.to(reachable.device) & reachable
 
 
+Counts = dict[str, tuple[Int[Tensor, " c"], Int[Tensor, " c"]]]
+"""By arm, how often each of its candidates was executed, and how often with success."""
+
+
 class _Executor:
-    """Executes batches of episodes of a task with candidates, one batch after the other; `region` as in
+    """Executes batches of episodes of a task with candidates by arm, one batch after the other; `region` as in
     `rank_in_task`."""
 
-    def __init__(self, env_id: str, preset: str, candidates: GraspCandidates, region: bool):
-        self.task, self.count = make_task(env_id, BATCH, preset=preset, grasps=candidates), len(candidates)
+    def __init__(self, env_id: str, preset: str, candidates: Mapping[str, GraspCandidates], region: bool):
+        self.task = make_task(env_id, BATCH, preset=preset, grasps=candidates)
+        self.sizes = {arm: len(found) for arm, found in candidates.items()}
         self.region = region
 
-    def __call__(self, case: tuple[int, int]) -> tuple[Int[Tensor, " c"], Int[Tensor, " c"]]:
-        """How often each candidate was executed, and how often with success, in a batch of (index, seed)."""
+    def __call__(self, case: tuple[int, int]) -> Counts:
+        """What comes of a batch of (index, seed)."""
         index, seed = case
-        self.task.narrow = pick = _Balanced(self.count, index * BATCH)
-        won = _executed(self.task, seed, self.region).cpu() & pick.possible
-        return pick.tries, torch.bincount(pick.led[won], minlength=self.count)
+        picks = {arm: _Balanced(count, index * BATCH) for arm, count in self.sizes.items()}
+        self.task.narrow = picks
+        counts = {}
+        for arm, won in _executed(self.task, seed, self.region).items():
+            if arm in picks:
+                led = picks[arm].led[won.cpu() & picks[arm].possible]
+                counts[arm] = picks[arm].tries, torch.bincount(led, minlength=self.sizes[arm])
+        return counts
 
 
 def rank_in_task(
@@ -120,28 +131,54 @@ def rank_in_task(
         processes: number of processes, one per core by default; 1 stays in this process.
         region: count the task's success; otherwise whether the object is held in the end, whatever region of it.
     """
+    (arm,) = find_task(env_id).ARMS
+    return rank_arms(env_id, {arm: candidates}, episodes, preset, progress, seed, processes, region)[arm]
+
+
+def rank_arms(
+    env_id: str,
+    candidates: Mapping[str, GraspCandidates],
+    episodes: int,
+    preset: str = "standard",
+    progress: Callable[[int, int], None] | None = None,
+    seed: int = SEED,
+    processes: int | None = None,
+    region: bool = True,
+) -> dict[str, TaskRanking]:
+    """The same for candidates of several arms, which are executed in the same episodes.
+
+    With stages of its own for each arm, an arm has succeeded when all of its stages are done and nothing overlapped too
+    deep. Arguments as of `rank_in_task`, but `candidates` by arm; arms that are left out use the task's own.
+    """
     cases = [(index, seed + index) for index in range(-(-episodes // BATCH))]
 
     def report(done: int, total: int) -> None:
         if progress is not None:
             progress(done * BATCH, total * BATCH)
 
-    found = run_cases(_Executor, (env_id, preset, candidates, region), cases, processes, report, chunk=1)
-    tries, wins = (torch.stack(counts).sum(0) for counts in zip(*found, strict=True))
-    return TaskRanking(tries, wins / tries.clamp(min=1), len(cases) * BATCH * find_task(env_id).MAX_STEPS)
+    found: list[Counts] = run_cases(_Executor, (env_id, preset, candidates, region), cases, processes, report, chunk=1)
+    rankings = {}
+    for arm in candidates:
+        tries, wins = (torch.stack(counts).sum(0) for counts in zip(*(one[arm] for one in found), strict=True))
+        steps = len(cases) * BATCH * find_task(env_id).MAX_STEPS
+        rankings[arm] = TaskRanking(tries, wins / tries.clamp(min=1), steps)
+    return rankings
 
 
-def _executed(task: DoraEnv, seed: int, region: bool) -> Bool[Tensor, " n"]:
-    """Which of n episodes of the scripted solution succeed, or hold the object in the end whatever its region, without
-    failure on the way and within `CLEAN`."""
+def _executed(task: DoraEnv, seed: int, region: bool) -> dict[str, Bool[Tensor, " n"]]:
+    """By arm, which of n episodes of the scripted solution succeed, or hold the object in the end whatever its region,
+    without failure on the way and within `CLEAN`."""
     task.reset(seed=seed)
     failed = torch.zeros(task.num_envs, dtype=torch.bool, device=task.device)
     info: dict[str, Tensor] = {}
     for _ in range(task.max_steps):
         *_, info = task.step(task.scripted_action())
         failed |= info["fail"]
-    won = info["success"] if region else task.task.held(task.snapshot)
-    return won & ~failed & (task.memory.max_penetration <= CLEAN * task.config.penetration_limit)
+    clean = ~failed & (task.memory.max_penetration <= CLEAN * task.config.penetration_limit)
+    if isinstance(task.machine, ParallelStages):
+        return {arm: machine.finished & clean for arm, machine in task.machine.machines.items()}
+    (arm,) = task.arms
+    return {arm: clean & (info["success"] if region else task.task.held(task.snapshot))}
 
 
 def ranked(candidates: GraspCandidates, ranking: TaskRanking) -> GraspCandidates:

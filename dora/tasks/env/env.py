@@ -3,8 +3,9 @@
 It reads the simulator once per control step; then only pure functions of that snapshot decide.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, ClassVar, cast
 
 import gymnasium as gym
@@ -52,7 +53,8 @@ class DoraEnv(BaseEnv):
         preset: how much episodes are randomised, see `dora.tasks.mdp.randomisation`.
         config: numbers that differ from the task's own, by name (nested for weights and randomisation), or all of
             them as an instance of the task's `CONFIG`.
-        grasps: candidates in place of those that come with Dora, of the task's object and robot; one arm only.
+        grasps: candidates in place of those that come with Dora, of the task's object and robot; with several arms a
+            dictionary by arm.
         robot_uids: name of a folder in `robots/`, or a tuple with one for each arm; the task's own by default.
         sim_backend: as in ManiSkill; "auto" on a machine without CUDA is "physx_cpu", or "physx_cpu_batch" for
             num_envs > 1.
@@ -63,8 +65,6 @@ class DoraEnv(BaseEnv):
     """
 
     SUPPORTED_REWARD_MODES = ("dense", "normalized_dense", "sparse", "none", "paper")
-    SUPPORTED_ROBOTS: ClassVar[list[Any]] = ["diana7_hit"]
-
     TASK: ClassVar[type[Task]]
     """What the environment is about; set by `register_task`."""
 
@@ -72,8 +72,8 @@ class DoraEnv(BaseEnv):
     """ManiSkill's: a `DescribedRobot`, or a `MultiAgent` of them."""
     task: Any
     """The task that it has, an instance of `TASK`."""
-    narrow: Callable[[Tensor], Tensor] | None = None
-    """Takes the (b, c) candidates that b new episodes may use and returns fewer; to try candidates one by one."""
+    narrow: Mapping[str, Callable[[Tensor], Tensor]] = MappingProxyType({})
+    """By arm: takes the (b, c) candidates that b new episodes may use and returns fewer; to try them one by one."""
     chosen_start: Callable[[Tensor], Tensor] | None = None
     """Takes the random numbers (b, DRAWS) of b new starts and returns those that are used; to choose a start."""
     resetting = False
@@ -103,8 +103,8 @@ class DoraEnv(BaseEnv):
             guidance, guidance_parts, hand_joints, task_config(self.TASK.CONFIG, preset, config), robot_uids,
             self.TASK.robots(), num_envs, control_mode, sim_backend, render_backend, render_mode, obs_mode,
         )  # fmt: skip
-        check_grasps(grasps, tuple(self.TASK.ARMS))
-        self.parts, self.config, self._grasps = options.parts, options.config, grasps
+        self._grasps = check_grasps(grasps, tuple(self.TASK.ARMS))
+        self.parts, self.config = options.parts, options.config
         self.task, several = self.TASK(self.config), len(options.robots) > 1
         self._shares, self._tables = dict[str, float](), dict[str, ReachTable]()
         self._forced_scale: Tensor | None = None

@@ -1,6 +1,6 @@
 """The options that every Dora task takes, checked before anything is built."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -110,14 +110,23 @@ def check_options(
     return TaskOptions(parts, config, robots, mode, sim_backend, render_backend)
 
 
-def check_grasps(grasps: Any, arms: Sequence[str]) -> None:
-    """Refuses `grasps` of a task that are no candidates, or of a task with several arms."""
+def check_grasps(grasps: Any, arms: Sequence[str]) -> dict[str, GraspCandidates]:
+    """The `grasps` of a task by arm: given like that, or those of the only arm; none where nothing is given.
+
+    Raises:
+        InputError: they are no candidates, of no arm, or of one of several that is not named.
+    """
     if grasps is None:
-        return
-    if not isinstance(grasps, GraspCandidates):
-        raise InputError(f"grasps must be GraspCandidates, such as GraspCandidates.load(path), not {grasps!r}")
-    if len(arms) > 1:
-        raise InputError(f"grasps are of one arm, and there are {', '.join(arms)}: leave them out")
+        return {}
+    if not isinstance(grasps, Mapping) and len(arms) > 1:
+        raise InputError(f"grasps must be a dictionary by arm, and there are {', '.join(arms)}: name the arms.")
+    given = dict(grasps) if isinstance(grasps, Mapping) else {arms[0]: grasps}
+    for arm, found in given.items():
+        if arm not in arms:
+            raise InputError(f"grasps are of {shown(arm)}, and there is only {', '.join(arms)}: name one of these.")
+        if not isinstance(found, GraspCandidates):
+            raise InputError(f"grasps must be GraspCandidates, such as GraspCandidates.load(path), not {found!r}")
+    return given
 
 
 def _robots(robot_uids: Any, arms: Sequence[str]) -> tuple[str, ...]:

@@ -38,7 +38,9 @@ def register_task(env_id: str) -> Callable[[type[Task]], type[Task]]:
     def register(task: type[Task]) -> type[Task]:
         """Makes and registers the environment class of a task, which is returned unchanged."""
         name = task.__name__.removesuffix("Task") + "Env"
-        members = {"TASK": task, "__doc__": task.__doc__, "__module__": task.__module__}
+        robots = tuple(task.robots())
+        supported = [robots if len(robots) > 1 else robots[0]]
+        members = {"TASK": task, "__doc__": task.__doc__, "__module__": task.__module__, "SUPPORTED_ROBOTS": supported}
         env = type(name, (DoraEnv,), members)
         register_env(env_id, max_episode_steps=task.MAX_STEPS)(env)
         registry[env_id].__class__ = TaskSpec

@@ -1,6 +1,6 @@
 """The scene of a task: table, objects with their properties, robots with their guides, and the reader of all that."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -112,7 +112,7 @@ class TaskScene:
         task: Task,
         agents: Sequence[DescribedRobot],
         parts: frozenset[str],
-        grasps: GraspCandidates | None,
+        grasps: Mapping[str, GraspCandidates],
         tables: dict[str, ReachTable],
     ) -> None:
         """Makes the arms of a task, each with its guide.
@@ -121,14 +121,14 @@ class TaskScene:
             task: says what they are about.
             agents: their robots, in order.
             parts: of guidance in force.
-            grasps: candidates in place of the task's own.
+            grasps: candidates in place of the task's own, by arm.
             tables: tables of f_reach that are known already.
         """
         region = REGION in parts or not parts
         for (name, spec), agent in zip(task.ARMS.items(), agents, strict=True):
-            found = task.candidates(name, region) if grasps is None else grasps
+            found = grasps[name] if name in grasps else task.candidates(name, region)
             adapted = task.adapted(found, name, agent.description)
-            same = region or grasps is not None
+            same = region or name in grasps
             starts = None if same else task.adapted(task.candidates(name), name, agent.description)
             choice = CandidateChoice(adapted, self.num_envs, self.device)
             size = int(np.prod(agent.single_action_space.shape or ()))
