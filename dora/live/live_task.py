@@ -131,7 +131,7 @@ class LiveTask:
             return ()
         arm = self.env.arm
         pose = self.env.objects[arm.spec.object].pose
-        return tuple(self.env.task.reachable(arm, pose.p, pose.q)[0].nonzero()[:, 0].tolist())
+        return tuple(self.env.task.reachable(arm, torch.arange(1), pose.p, pose.q)[0].nonzero()[:, 0].tolist())
 
     def _shares_now(self) -> tuple[float, ...]:
         """The start as shares of the ranges of its numbers."""

@@ -214,7 +214,7 @@ class _Usable:
         task = self._task
         task.guide.choice.candidates = candidates.to(task.device)
         pose = task.target_object.pose
-        return (task.task.reachable(task.arm, pose.p, pose.q).float().mean(0) >= USABLE).cpu()
+        return (task.task.reachable(task.arm, torch.arange(STARTS), pose.p, pose.q).float().mean(0) >= USABLE).cpu()
 
 
 def rank_bundled_set(name: str | Path, phase: Callable[[str], Callable[[int, int], None]], region: bool = True) -> Path:

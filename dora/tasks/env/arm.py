@@ -84,6 +84,11 @@ class Arm:
         return self._table(self.name, self.guide.choice.candidates)
 
     @property
+    def start_candidates(self) -> GraspCandidates:
+        """The candidates that decide where the object starts."""
+        return self.guide.choice.candidates if self._starts is None else self._starts
+
+    @property
     def start_table(self) -> ReachTable | None:
         """The same of the candidates that decide where the object starts."""
         return self.reach_table if self._starts is None else self._table(f"{self.name}/starts", self._starts)

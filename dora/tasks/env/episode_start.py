@@ -85,7 +85,7 @@ def begin_episodes(env: Any, rows: Int[Tensor, " b"]) -> None:
     for arm, e in zip(env.arms.values(), errors, strict=True):
         pose = env.objects[arm.spec.object].pose
         p, q = pose.p[rows], pose.q[rows]
-        arm.choose(rows, p, q, env.task.reachable(arm, p, q), e, randomisation, env.narrow.get(arm.name))
+        arm.choose(rows, p, q, env.task.reachable(arm, rows, p, q), e, randomisation, env.narrow.get(arm.name))
 
 
 def _draws(env: Any, rows: Tensor) -> tuple[Tensor, ...]:

@@ -138,9 +138,15 @@ class Task(ABC):
         return nominal * (1 + self.config.randomisation.mass * (2 * u - 1))
 
     def reachable(
+        self, arm: Arm, rows: Int[Tensor, " b"], object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]
+    ) -> Bool[Tensor, "b c"]:
+        """f_reach: which candidates an arm can carry out in the environments `rows`, when its object is like this."""
+        return self.graspable(arm, object_p, object_q)
+
+    def graspable(
         self, arm: Arm, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]
     ) -> Bool[Tensor, "b c"]:
-        """f_reach: which candidates an arm can carry out when its object stands like this."""
+        """Which candidates an arm can carry out when its object stands like this on the table."""
         if (table := arm.reach_table) is not None:
             return table.mask(object_p, object_q)
         count = len(arm.guide.choice.candidates)
@@ -151,7 +157,7 @@ class Task(ABC):
     ) -> Bool[Tensor, "b c"]:
         """f_reach of the candidates that decide where objects start, which are the same with all guidance."""
         table = arm.start_table
-        return self.reachable(arm, object_p, object_q) if table is None else table.mask(object_p, object_q)
+        return self.graspable(arm, object_p, object_q) if table is None else table.mask(object_p, object_q)
 
     def extended(self, s: Snapshot) -> Snapshot:
         """The snapshot with what this task reads in addition: a subclass of `Snapshot`. Changes nothing."""

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import sapien
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from mani_skill.utils.structs import Actor, Link, Pose
 from torch import Tensor
 
@@ -203,7 +203,7 @@ class HammerTask(Task):
         return with_waiting_hand(candidates, robot, start_posture(self.ARMS[arm]))
 
     def reachable(
-        self, arm: Arm, object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]
+        self, arm: Arm, rows: Int[Tensor, " b"], object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]
     ) -> Bool[Tensor, "b c"]:
         """f_reach: which candidates the hand can wait with below a hammer that is released like this."""
         return within_reach(arm.guide.choice.candidates, object_p, object_q, *arm.home)

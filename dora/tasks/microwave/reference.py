@@ -39,7 +39,7 @@ class OpenSettings:
     """Time from the pre-grasp to the closed hand [s]."""
     pull: float = 0.20
     """Speed of the wrist along the arc of the handle [m/s]."""
-    lead: float = 0.10
+    lead: float = 0.16
     """Angle by which the wrist is led ahead of the door [rad]."""
     target: float = 1.45
     """Angle to which the door is opened [rad]."""
@@ -67,7 +67,7 @@ class PlaceSettings:
     """Distance of the cube's centre from the front plane where the hand waits for the door [m]."""
     depth: float = 0.12
     """Depth at which the cube is put down [m]."""
-    carry_at: float = 0.7
+    carry_at: float = 1.15
     """Angle of the door from which the cube is carried before the cavity: the left hand is there before [rad]."""
     open_at: float = 1.2
     """Angle of the door from which the cube is carried in [rad]."""

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
 import sapien
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from mani_skill.utils.structs import Actor, Link, Pose
 from torch import Tensor
 
@@ -23,7 +23,7 @@ from dora.sim.actors import build_box
 from dora.sim.cameras import CameraSpec
 from dora.sim.hinged import HingedObject, drawn_mount
 from dora.sim.shapes import DrawnShape
-from dora.tasks.env.arm import ArmSpec
+from dora.tasks.env.arm import Arm, ArmSpec
 from dora.tasks.env.registration import register_task
 from dora.tasks.env.scene import TaskScene
 from dora.tasks.env.starts import STANDING_DRAWS, standing
@@ -34,6 +34,7 @@ from dora.tasks.guidance.waypoints import WaypointReference
 from dora.tasks.mdp.mdp import Mdp
 from dora.tasks.mdp.snapshot import Snapshot, extended
 from dora.tasks.microwave.mdp import OBSERVATIONS, MicrowaveConfig, failed, paper_terms, stages, terms
+from dora.tasks.microwave.reach import OvenReach, opening_way, oven_reach, placing_way
 from dora.tasks.microwave.reference import opening, placing
 from dora.tasks.microwave.snapshot import CAVITY, LEFT, RIGHT, MicrowaveSnapshot
 
@@ -93,7 +94,8 @@ class MicrowaveTask(Task):
 
     def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
         c: MicrowaveConfig = self.config
-        return best_candidates(self.ARMS[arm].object, CLASSES[arm], c.fewest, c.most_candidates, region)
+        task = "DoraMicrowave-v1" if arm == RIGHT and region else None
+        return best_candidates(self.ARMS[arm].object, CLASSES[arm], c.fewest, c.most_candidates, region, task)
 
     def adapted(self, candidates: GraspCandidates, arm: str, robot: RobotDescription) -> GraspCandidates:
         """The left hand is the mirror image of the right one, for which the candidates were found."""
@@ -114,6 +116,7 @@ class MicrowaveTask(Task):
     def build(self, scene: TaskScene, name: str, scale: Float[np.ndarray, " n"]) -> Actor | Link:
         """The microwave around its handle, and the cube."""
         obj = load_object(name)
+        self._reach: dict[tuple[str, int], OvenReach] = {}
         if name == "cube":
             return build_box(scene.scene, obj, scale, BLUE, sapien.Pose([*self.config.centre, obj.support]))
         self.oven = HingedObject(scene.scene, obj, oven_mount())
@@ -137,13 +140,42 @@ class MicrowaveTask(Task):
         turn[:, 2] = r.oven_rotation * oven[:, 2]
         resistance = torch.tensor([hinge.damping, hinge.friction, hinge.latch], device=scene.device)
         damping, friction, latch = (resistance * (1 + r.hinge * oven[:, 3:])).unbind(-1)
-        self.oven.begin(rows, position, quaternion_from_rotation_vector(turn), damping, friction, latch)
-        grid = self.start_grid(RIGHT)
+        quaternion = quaternion_from_rotation_vector(turn)
+        self.oven.begin(rows, position, quaternion, damping, friction, latch)
+        grid, right = self.start_grid(RIGHT), scene.arms[RIGHT]
         assert grid is not None
-        reachable = partial(self.startable, scene.arms[RIGHT])
+        way = self._followed(right, position, quaternion, right.start_candidates)
+
+        def reachable(p: Tensor, q: Tensor) -> Tensor:
+            return self.startable(right, p, q) & way.repeat_interleave(len(p) // len(way), 0)
+
         actor = scene.objects["cube"]
         assert isinstance(actor, Actor)
         actor.set_pose(Pose.create_from_pq(*standing(cube, scene.halves["cube"][rows, 2], grid, reachable)))
+
+    def reachable(
+        self, arm: Arm, rows: Int[Tensor, " b"], object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]
+    ) -> Bool[Tensor, "b c"]:
+        """f_reach: the candidates whose way along the door, or into the cavity, the arm can follow, and with which it
+        can grasp the cube where it stands."""
+        body = self.oven.links[oven_mount().links[0].name].pose
+        way = self._followed(arm, body.p[rows], body.q[rows], arm.guide.choice.candidates)
+        return way & self.graspable(arm, object_p, object_q)
+
+    def _followed(self, arm: Arm, p: Tensor, q: Tensor, candidates: GraspCandidates) -> Bool[Tensor, "b c"]:
+        """The candidates whose way the arm can follow with microwaves at these world poses."""
+        c: MicrowaveConfig = self.config
+        key = arm.name, id(candidates)
+        if key not in self._reach:
+            mount, r, place = oven_mount(), c.randomisation, c.placing
+            hinge, handle = ((torch.tensor(x.position), torch.tensor(x.quaternion)) for x in mount.links[1:])
+            height = CAVITY[2][0] + float(load_object("cube").mesh.extents[2]) / 2 + place.raised
+            if arm.name == LEFT:
+                way = opening_way(hinge, handle, c.opening.standoff, c.opening.target)
+            else:
+                way = placing_way(place.front, place.depth, height)
+            self._reach[key] = oven_reach(arm, candidates, way, c.oven, r.oven_position, r.oven_rotation)
+        return self._reach[key].mask(p, q)
 
     def masses(self, name: str, nominal: Float[Tensor, " b"], u: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
         return nominal if name == "microwave" else super().masses(name, nominal, u)
