@@ -181,7 +181,8 @@ def mounted(folder: Path, change: tuple[str, str]) -> Mount:
 def test_a_damaged_file_ends_in_a_sentence(tmp_path: Path, change: tuple[str, str], message: str):
     with pytest.raises(InputError, match=message) as refused:
         mounted(tmp_path, change)
-    assert ARTICULATION_FILE in str(refused.value) and "\n" not in str(refused.value)
+    assert ARTICULATION_FILE in str(refused.value)
+    assert "\n" not in str(refused.value)
 
 
 def test_a_file_with_another_number_has_another_door(tmp_path: Path):

@@ -1,0 +1,299 @@
+"""DoraMicrowave-v1: geometry, stages and references on invented states, and what the scripted solution does."""
+
+from math import pi, radians
+from typing import Any
+
+import pytest
+import torch
+from invented import GOAL_SHAPES, HAND_SHAPES, OBJECT_SHAPES, SHARED_SHAPES, TIP_RADIUS, record
+from torch import Tensor
+
+import dora.tasks as tasks
+from dora.geometry.poses import compose
+from dora.geometry.rotations import (
+    quaternion_apply,
+    quaternion_from_rotation_vector,
+    quaternion_multiply,
+    rotation_angle,
+)
+from dora.tasks.mdp.snapshot import GoalState, HandState, ObjectState
+from dora.tasks.microwave import mdp
+from dora.tasks.microwave.mdp import MicrowaveConfig
+from dora.tasks.microwave.reference import entry_turn, with_door
+from dora.tasks.microwave.snapshot import LEFT, RIGHT, MicrowaveSnapshot, cube_in_oven, hand_out, inside
+from dora.tasks.microwave.task import MicrowaveTask, mirrored, oven_mount
+
+CONFIG = MicrowaveConfig()
+"""The task's own numbers."""
+STAGES, TERMS = mdp.stages(CONFIG), mdp.terms(CONFIG).terms
+OVEN = (0.7, 0.05, 0.1)
+"""Where the invented microwave stands [m]."""
+YAW = 0.15
+"""How it is turned [rad]."""
+
+
+def turned(angle: float, n: int = 2) -> Tensor:
+    """Orientation (n, 4) after a turn about the vertical [rad]."""
+    return quaternion_from_rotation_vector(torch.tensor([[0.0, 0.0, angle]]).repeat(n, 1))
+
+
+def in_world(*local: float, n: int = 2) -> Tensor:
+    """A point of the microwave's frame in the world (n, 3) [m]."""
+    return torch.tensor(OVEN) + quaternion_apply(turned(YAW, n), torch.tensor([local]).repeat(n, 1))
+
+
+def invented(
+    left: dict[str, Any] | None = None,
+    right: dict[str, Any] | None = None,
+    handle: dict[str, Any] | None = None,
+    cube: dict[str, Any] | None = None,
+    goals: dict[str, dict[str, Any]] | None = None,
+    n: int = 2,
+    **given: Any,
+) -> MicrowaveSnapshot:
+    """A snapshot of zeros and unit quaternions with a shut microwave, and what is given of each record."""
+    tips = {"tip_radius": TIP_RADIUS}
+    half = {"half": torch.full((n, 3), 0.03)}
+    hands = {
+        LEFT: record(HandState, HAND_SHAPES, n, tips | (left or {})),
+        RIGHT: record(HandState, HAND_SHAPES, n, tips | (right or {})),
+    }
+    shut = torch.tensor(oven_mount().object_link.quaternion)
+    objects = {
+        "microwave": record(ObjectState, OBJECT_SHAPES, n, half | (handle or {})),
+        "cube": record(ObjectState, OBJECT_SHAPES, n, half | (cube or {})),
+    }
+    own = {
+        "oven_p": torch.tensor(OVEN).repeat(n, 1), "oven_q": turned(YAW, n), "door": torch.zeros(n),
+        "door_speed": torch.zeros(n), "wrists": torch.stack([hand.wrist_p for hand in hands.values()], 1),
+        "tips_of_placer": hands[RIGHT].tip_p, "cube_p": objects["cube"].p,
+        "bar": torch.tensor([[0.03, 0.0, -0.09], [0.03, 0.0, 0.09]]), "bar_radius": 0.008, "shut_q": shut,
+    }  # fmt: skip
+    records = {
+        "hands": hands,
+        "objects": objects,
+        "goals": {arm: record(GoalState, GOAL_SHAPES, n, (goals or {}).get(arm, {})) for arm in hands},
+        "handles": {LEFT: "microwave", RIGHT: "cube"},
+        "stages": {LEFT: torch.zeros(n, dtype=torch.long), RIGHT: torch.zeros(n, dtype=torch.long)},
+    }
+    return record(MicrowaveSnapshot, SHARED_SHAPES, n, records | own | given)
+
+
+def out(n: int = 2) -> dict[str, Tensor]:
+    """A right hand in front of the microwave."""
+    return {"wrist_p": in_world(-0.2, 0.0, 0.1, n=n), "tip_p": in_world(-0.05, 0.0, 0.1, n=n)[:, None].repeat(1, 5, 1)}
+
+
+# ---------------------------------------------------------------------- geometry
+
+
+def test_points_are_seen_from_the_microwave_wherever_it_stands():
+    s = invented(cube={"p": in_world(0.1, -0.02, 0.05)})
+    torch.testing.assert_close(cube_in_oven(s), torch.tensor([[0.1, -0.02, 0.05]] * 2), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ((0.12, 0.0, 0.05), True), ((0.03, 0.0, 0.05), False), ((-0.1, 0.0, 0.05), False), ((0.12, 0.25, 0.05), False),
+        ((0.12, 0.0, 0.32), False), ((0.12, 0.0, -0.05), False), ((0.40, 0.0, 0.05), False),
+    ],
+)  # fmt: skip
+def test_a_cube_is_inside_when_all_of_it_is(place: tuple[float, ...], expected: bool):
+    assert inside(invented(cube={"p": in_world(*place)}).of(RIGHT)).tolist() == [expected] * 2
+
+
+@pytest.mark.parametrize("part", ["wrist_p", "tip_p"])
+def test_a_hand_is_out_when_wrist_and_fingertips_are(part: str):
+    assert hand_out(invented(right=out())).all()
+    late = out() | {part: (in_world(0.05, 0.0, 0.1) if part == "wrist_p" else out()["tip_p"] + 0.2)}
+    assert not hand_out(invented(right=late)).any()
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, 1.4])
+def test_the_door_is_observed_from_the_pose_of_the_handle(angle: float):
+    """The handle of a door that has opened by an angle is turned by it against the vertical."""
+    shut = quaternion_multiply(turned(YAW), torch.tensor(oven_mount().object_link.quaternion).expand(2, 4))
+    s = invented(handle={"q": quaternion_multiply(turned(-angle), shut)}, cube={"p": in_world(0.1, 0.0, 0.0)})
+    seen = s.reobserved()
+    torch.testing.assert_close(seen.door, torch.full((2,), angle), atol=1e-5, rtol=0)
+    torch.testing.assert_close(seen.cube_p, s.objects["cube"].p)
+
+
+def test_what_is_led_with_the_door_keeps_its_place_on_it():
+    """Turned by the rest of the way about the hinge, the wrist is as far from the hinge, and as much turned."""
+    hinge = torch.tensor(oven_mount().hinge_link.position)
+    goal = {"p": in_world(-0.1, -0.16, 0.15), "q": turned(0.3)}
+    s = invented(goals={LEFT: goal}).of(LEFT)
+    p, q = with_door(s, hinge, torch.tensor([0.0, 0.5]))
+    torch.testing.assert_close(p[0], goal["p"][0])
+    at = in_world(*hinge.tolist())[0]
+    torch.testing.assert_close((p[1] - at).norm(), (goal["p"][1] - at).norm())
+    assert float(rotation_angle(q, goal["q"])[1]) == pytest.approx(0.5, abs=1e-5)
+    assert p[1, 0] < p[0, 0]  # towards the robots
+
+
+def test_the_cube_is_carried_in_with_the_fingers_ahead():
+    from dora.tasks.guidance.waypoints import Kept
+
+    q = quaternion_from_rotation_vector(torch.randn(2, 3, generator=torch.Generator().manual_seed(3)))
+    zero = torch.zeros(2, 3), turned(0.0)
+    turn = entry_turn(invented().of(RIGHT), Kept((torch.zeros(2, 3), q), zero, zero))
+    fingers = quaternion_apply(quaternion_multiply(turn, q), torch.tensor([[0.0, 0.0, 1.0]] * 2))
+    torch.testing.assert_close(torch.atan2(fingers[:, 1], fingers[:, 0]), torch.full((2,), YAW), atol=1e-5, rtol=0)
+    before = quaternion_apply(q, torch.tensor([[0.0, 0.0, 1.0]] * 2))
+    torch.testing.assert_close(fingers[:, 2], before[:, 2])  # about the vertical alone
+
+
+def test_mirrored_candidates_are_mirror_images():
+    """A point of the mirrored hand is the mirror image of the same point of the hand."""
+    found = tasks.find_task("DoraMicrowave-v1")(CONFIG).candidates(RIGHT).select(slice(4))
+    image = mirrored(found)
+    flip = torch.tensor([1.0, -1.0, 1.0])
+    point = torch.tensor([0.05, 0.02, 0.11]).repeat(4, 1)
+    there, _ = compose((image.position, image.quaternion), (point * flip, image.quaternion))
+    here, _ = compose((found.position, found.quaternion), (point, found.quaternion))
+    torch.testing.assert_close(there, here * flip, atol=1e-6, rtol=0)
+    assert torch.equal(mirrored(image).position, found.position)
+
+
+# ------------------------------------------------------------------------ stages
+
+
+def test_each_arm_has_stages_of_its_own():
+    assert [stage.name for stage in STAGES[LEFT]] == ["reach_handle", "grasp_handle", "open"]
+    assert [stage.name for stage in STAGES[RIGHT]] == ["reach_cube", "grasp_cube", "carry", "put_in", "leave"]
+
+
+def test_the_door_is_open_from_sixty_degrees():
+    s = invented(door=torch.tensor([radians(59.0), radians(61.0)])).of(LEFT)
+    assert STAGES[LEFT][2].done(s).tolist() == [False, True]
+
+
+@pytest.mark.parametrize("missing", ["nothing", "inside", "still", "untouched", "out"])
+def test_the_cube_is_put_down_when_it_lies_inside_alone(missing: str):
+    touch = torch.zeros(2, 6, dtype=torch.bool)
+    cube = {"p": in_world(0.12, 0.0, 0.05)}
+    right = out() | {"touch": touch}
+    if missing == "inside":
+        cube = {"p": in_world(-0.05, 0.0, 0.05)}
+    elif missing == "still":
+        cube |= {"v": torch.full((2, 3), 0.05)}
+    elif missing == "untouched":
+        right |= {"touch": ~touch}
+    elif missing == "out":
+        right |= {"wrist_p": in_world(0.05, 0.0, 0.1)}
+    s = invented(right=right, cube=cube)
+    assert STAGES[RIGHT][-1].done(s.of(RIGHT)).all() == (missing == "nothing")
+    paid = TERMS["placed"].value(invented(right=right, cube=cube, door=torch.tensor([0.5, 1.2])))
+    assert paid.tolist() == [0.0, float(missing == "nothing")]
+
+
+def test_an_overlap_above_the_limit_pays_no_end():
+    s = {"right": out(), "cube": {"p": in_world(0.12, 0.0, 0.05)}, "door": torch.full((2,), 1.2)}
+    paid = TERMS["placed"].value(invented(**s, max_penetration=torch.tensor([0.004, 0.006])))
+    assert paid.tolist() == [1.0, 0.0]
+
+
+BETTER: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "open": ({"door": torch.tensor([0.1, 0.6])}, {LEFT: 2}),
+    "put": ({"cube": {"p": torch.stack([in_world(-0.1, 0.0, 0.1)[0], in_world(0.05, 0.0, 0.1)[0]])}}, {RIGHT: 3}),
+    "carry": ({"cube": {"p": torch.stack([in_world(-0.4, -0.4, 0.0)[0], in_world(-0.2, 0.0, 0.085)[0]])}}, {RIGHT: 2}),
+}
+"""Two states of which the second is better, and the stages in which a term pays."""
+
+
+@pytest.mark.parametrize("name", BETTER)
+def test_terms_grow_with_what_they_are_there_for_in_their_stage(name: str):
+    state, stage = BETTER[name]
+    stages = {arm: torch.full((2,), stage.get(arm, 0)) for arm in (LEFT, RIGHT)}
+    worse, better = TERMS[name].value(invented(**state, stages=stages)).tolist()
+    assert worse < better <= 1
+    assert TERMS[name].value(invented(**state)).tolist() == [0.0, 0.0]  # nothing before its stage
+
+
+def test_no_term_leaves_its_bounds():
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        spread = {"p": torch.randn(8, 3, generator=generator)}
+        s = invented(
+            n=8, cube=spread, handle=spread, door=2 * torch.rand(8, generator=generator),
+            stages={arm: torch.randint(0, 6, (8,), generator=generator) for arm in (LEFT, RIGHT)},
+            action=2 * torch.rand(8, 26, generator=generator) - 1,
+        )  # fmt: skip
+        for name, term in TERMS.items():
+            value = term.value(s)
+            assert ((value >= 0) & (value <= 1)).all(), name
+
+
+# -------------------------------------------------------------------- simulation
+
+
+@pytest.fixture(scope="module")
+def task():
+    made = tasks.make_task("DoraMicrowave-v1", 4, preset="standard")
+    yield made
+    made.close()
+
+
+def run(task: Any, steps: int) -> MicrowaveSnapshot:
+    """The state after some control steps of the scripted solution."""
+    for _ in range(steps):
+        task.step(task.scripted_action())
+    return task.snapshot
+
+
+def test_microwaves_differ_and_start_shut(task: Any):
+    task.reset(seed=1)
+    s = task.snapshot
+    assert s.oven_p[:, :2].std(0).min() > 0.005
+    assert (s.oven_p[:, :2] - torch.tensor(CONFIG.oven[:2])).abs().max() <= 0.04
+    assert s.door.abs().max() < 1e-3
+    assert len({round(float(x), 5) for x in task.task.oven.get_state()["damping"]}) == 4
+
+
+def test_the_handle_is_the_object_of_the_left_arm_and_no_part_of_the_world(task: Any):
+    task.reset(seed=1)
+    assert task.snapshot.handles == {LEFT: "microwave", RIGHT: "cube"}
+    assert task.objects["microwave"] is task.task.oven.link
+    assert {link.name.rpartition("-")[2] for link in task.task.world(task.task_scene)[1:]} == {"body", "door"}
+
+
+def test_a_restored_state_has_the_same_microwave_and_goes_on_alike(task: Any):
+    task.reset(seed=2)
+    run(task, 70)
+    state = task.get_state_dict()
+    stages = {arm: index.tolist() for arm, index in task.machine.by_arm().items()}
+    resistance = task.task.oven.get_state()
+    after = run(task, 3)
+    task.reset(seed=3)
+    task.set_state_dict(state)
+    assert all(torch.equal(value, task.task.oven.get_state()[name]) for name, value in resistance.items())
+    assert {arm: index.tolist() for arm, index in task.machine.by_arm().items()} == stages
+    again = run(task, 3)
+    torch.testing.assert_close(again.door, after.door, atol=1e-3, rtol=0)
+    torch.testing.assert_close(again.wrists, after.wrists, atol=1e-3, rtol=0)
+    torch.testing.assert_close(again.cube_p, after.cube_p, atol=1e-3, rtol=0)
+
+
+def test_stages_of_the_arms_go_on_side_by_side(task: Any):
+    task.reset(seed=4)
+    together = False
+    for _ in range(120):
+        task.step(task.scripted_action())
+        left, right = (index for index in task.machine.by_arm().values())
+        together |= bool(((left > 0) & (left < 3) & (right > 0)).any())
+    assert together
+    assert task.stage_names == tuple(stage.name for arm in (LEFT, RIGHT) for stage in STAGES[arm])
+
+
+@pytest.mark.slow
+def test_the_scripted_solution_mostly_succeeds_without_randomisation():
+    made = tasks.make_task("DoraMicrowave-v1", 16, preset="none")
+    made.reset(seed=0)
+    info: dict[str, Tensor] = {}
+    for _ in range(MicrowaveTask.MAX_STEPS):
+        *_, info = made.step(made.scripted_action())
+    assert info["success"].float().mean() >= 0.75
+    assert made.task.oven.angle.max() < pi / 2
+    made.close()
