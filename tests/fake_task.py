@@ -95,10 +95,9 @@ class TwoPoints(PointMass):
     which is that both are near their goals, so it takes both agents.
     """
 
-    agent_columns: Any = {"left": ([0, 1, 4, 5, 8], [0, 1]), "right": ([2, 3, 6, 7, 8], [2, 3])}
-
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
+        self.agent_columns: Any = {"left": ([0, 1, 4, 5, 8], [0, 1]), "right": ([2, 3, 6, 7, 8], [2, 3])}
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.position, self.goal = torch.zeros(self.num_envs, 4), torch.zeros(self.num_envs, 4)
 

@@ -1,9 +1,10 @@
-"""A game of two agents in which each alone gains by what both together lose by; `python tests/matrix_game.py` measures it.
+"""A game in which each of two agents gains by what both together lose by; `python tests/matrix_game.py` measures it.
 
 The reward is REWARD[a_left, a_right], and both policies begin with action 0 most of the time. Learners are those of
 `dora.agents.learners.multi_agent`, with categorical in the place of Gaussian actors.
 """
 
+import itertools
 import statistics
 from typing import Any
 
@@ -63,9 +64,9 @@ class Game:
         passes = [torch.arange(BATCH)] * SETTINGS["epochs"]
         return learn_in_order(self.updates, parts, advantage, order, passes, compound=self.compound)
 
-    def run(self) -> list[float]:
+    def run(self, iterations: int = ITERATIONS) -> list[float]:
         """Expected reward at the beginning and after each iteration."""
-        return [self.value(), *(self.value() for _ in range(ITERATIONS) if self.iterate())]
+        return [self.value(), *(self.value() for _ in range(iterations) if self.iterate())]
 
 
 def categorical(actor: Logits) -> ProbabilisticTensorDictSequential:
@@ -79,12 +80,14 @@ def categorical(actor: Logits) -> ProbabilisticTensorDictSequential:
 
 def table() -> str:
     """What each way of learning does, as a Markdown table."""
-    rows = ["| clip | learner | reward at the end, median (lowest) | iterations that lose more than .02 | largest loss |"]
+    rows = [
+        "| clip | learner | reward at the end, median (lowest) | iterations that lose more than .02 | largest loss |"
+    ]
     rows.append("|---|---|---|---|---|")
     for clip in CLIPS:
         for name, compound in (("MAPPO", False), ("HAPPO", True)):
             runs = [Game(seed, compound, clip).run() for seed in range(SEEDS)]
-            changes = [after - before for run in runs for before, after in zip(run, run[1:], strict=False)]
+            changes = [after - before for run in runs for before, after in itertools.pairwise(run)]
             ends, falls = [run[-1] for run in runs], sum(change < -0.02 for change in changes)
             rows.append(
                 f"| {clip} | {name} | {statistics.median(ends):.2f} ({min(ends):.2f}) | {falls} of {len(changes)} | "

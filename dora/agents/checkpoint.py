@@ -139,7 +139,9 @@ def check_belongs(
     known, wanted = plain_agents(checkpoint.agents), plain_agents(agents or {})
     if not differences and list(known) != list(wanted):
         differences = [("agents", ", ".join(known) or "none", ", ".join(wanted) or "none")]
-    differences += [(f"columns of {n}", shown(known[n]), shown(wanted[n])) for n in known if known[n] != wanted.get(n)]
+    differences += [
+        (f"columns of {n}", shown(known[n]), shown(wanted[n])) for n in known if known[n] != wanted.get(n, known[n])
+    ]
     if exactly and not differences and theirs.digest() != ours.digest():
         differences = [("config digest", theirs.digest(), ours.digest())]
     if differences:
