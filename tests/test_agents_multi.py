@@ -26,6 +26,7 @@ from dora.agents.evaluation.play import evaluate_checkpoint, load_policy
 from dora.agents.learners.finite import check_modules
 from dora.agents.learners.learner import make_learner
 from dora.agents.learners.multi_agent import AgentUpdate, MultiAgentPPO, learn_in_order
+from dora.agents.learners.networks import last_layer
 from dora.agents.learners.ppo import PPO
 from dora.agents.runs.logging import TAGS
 from dora.agents.runs.recommended import recommended
@@ -284,7 +285,7 @@ def test_time_limits_bootstrap_and_failures_do_not(ended: str, monkeypatch: pyte
     monkeypatch.setattr("dora.agents.learners.multi_agent.learn_in_order", keep)
     monkeypatch.setattr("dora.agents.learners.multi_agent.standardised", lambda advantage: advantage)
     with torch.no_grad():
-        torch.nn.init.normal_(learner.critic.net[-1].weight)
+        torch.nn.init.normal_(last_layer(learner.critic.net).weight)
         value = learner.critic(learner.normaliser(batch["observation"][:, -1]))
         following = learner.critic(learner.normaliser(batch["next", "observation"][:, -1]))
     gamma, left = learner.config.gamma, 0.0 if ended == "terminated" else 1.0

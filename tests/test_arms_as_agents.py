@@ -121,8 +121,11 @@ after, earned, *_ = batch.step(np.concatenate([actions["left"], actions["right"]
 same = [bool((after[0].numpy() == joint).all())]
 same += [bool((start[0].numpy()[c[0]] == first[name]).all()) for name, c in columns.items()]
 same += [bool((after[0].numpy()[c[0]] == obs[name]).all()) for name, c in columns.items()]
-print(json.dumps({"shapes": shapes, "inside": inside, "same": same, "reward": reward, "earned": float(earned), "info": info,
-    "terminated": terminated, "truncated": truncated, "ends": ends, "agents": env.possible_agents, "name": env.metadata["name"]}))
+print(json.dumps({
+    "shapes": shapes, "inside": inside, "same": same, "reward": reward, "earned": float(earned), "info": info,
+    "terminated": terminated, "truncated": truncated, "ends": ends, "agents": env.possible_agents,
+    "name": env.metadata["name"],
+}))
 """)
     assert found["agents"] == ["left", "right"]
     assert [shape[1] for shape in found["shapes"].values()] == [26, 26]
@@ -168,7 +171,8 @@ from pathlib import Path
 from dora.agents.checkpoint import read_checkpoint
 from dora.commands import run
 folder = {str(tmp_path / "run")!r}
-small = "--num-envs 2 --workers 0 --learner.rollout 4 --learner.hidden 16 --eval-envs 2 --eval-episodes 2 --episodes 2 --preset none"
+small = "--num-envs 2 --workers 0 --learner.rollout 4 --learner.hidden 16 --preset none"
+small += " --eval-envs 2 --eval-episodes 2 --episodes 2"
 def call(text):
     sys.argv = ["run.py", *text.split()]
     status = run.main()
@@ -188,10 +192,14 @@ changed[:, own] += 1.0
 other = policy(changed)
 result = json.loads((Path(folder) / "result.json").read_text())
 evaluated = json.loads((Path(folder + "-eval") / "result.json").read_text())
+best = read_checkpoint(Path(folder) / "checkpoints" / "best.safetensors")
 print(json.dumps({{
-    "steps": result["env_steps"], "agent": result["agent"], "agents": list(read_checkpoint(Path(folder) / "checkpoints" / "best.safetensors").agents),
-    "left": bool(torch.equal(action[:, :26], other[:, :26])), "right": bool(torch.equal(action[:, 26:], other[:, 26:])),
-    "again": evaluated["success_rate"] == result["success_rate"], "return": evaluated["return_mean"] == result["return_mean"]}}))
+    "steps": result["env_steps"], "agent": result["agent"], "agents": list(best.agents),
+    "left": bool(torch.equal(action[:, :26], other[:, :26])),
+    "right": bool(torch.equal(action[:, 26:], other[:, 26:])),
+    "again": evaluated["success_rate"] == result["success_rate"],
+    "return": evaluated["return_mean"] == result["return_mean"],
+}}))
 """)
     assert found == {
         "steps": 40, "agent": agent, "agents": ["left", "right"], "left": True, "right": False, "again": True,

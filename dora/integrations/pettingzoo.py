@@ -58,8 +58,10 @@ class ArmsEnv(ParallelEnv):
         seen, commanded = (env.get_wrapper_attr(f"single_{what}_space") for what in ("observation", "action"))
         self._size, self._state = commanded.shape[0], np.zeros(seen.shape, np.float32)
         self.state_space = seen
-        self.observation_spaces = {name: _part(seen, columns) for name, (columns, _) in self._columns.items()}
-        self.action_spaces = {name: _part(commanded, columns) for name, (_, columns) in self._columns.items()}
+        observed = {name: _part(seen, columns) for name, (columns, _) in self._columns.items()}
+        acting = {name: _part(commanded, columns) for name, (_, columns) in self._columns.items()}
+        self.observation_spaces: dict[str, Any] = observed
+        self.action_spaces: dict[str, Any] = acting
         self.metadata = {**env.metadata, "name": env.spec.id if env.spec else type(env.unwrapped).__name__}
         self.render_mode = env.render_mode
 
