@@ -102,12 +102,16 @@ def test_actions_and_log_probabilities_are_those_of_the_actors():
     torch.manual_seed(0)
     learner = MultiAgentPPO(BOTH["mappo"], *SIZES, 1000, agents)
     observation = torch.randn(7, SIZES[0])
+    torch.manual_seed(3)
     data = learner.policy(TensorDict({"observation": observation}, [7]))
+    torch.manual_seed(3)
+    noise = torch.randn(7, SIZES[1])
     assert data["action_log_prob"].shape == (7, 2)
     for k, (name, columns) in enumerate(agents.items()):
         mean, std = learner.actor.of(name)(observation[:, list(columns.observation)])
         log_prob = torch.distributions.Normal(mean, std).log_prob(data["action"][:, list(columns.action)]).sum(-1)
         torch.testing.assert_close(data["action_log_prob"][:, k], log_prob)
+        torch.testing.assert_close(data["action"][:, list(columns.action)], mean + std * noise[:, list(columns.action)])
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         greedy = learner.policy(TensorDict({"observation": observation}, [7]))
     assert torch.equal(greedy["action"], learner.policy.greedy(observation))
@@ -234,6 +238,8 @@ def test_one_agent_is_ppo(agent: str):
     settings = {**SETTINGS, "minibatch": 10**6}
     torch.manual_seed(0)
     ppo = PPO(PPOConfig(**settings), *SIZES, 1000)
+    with torch.no_grad():
+        last_layer(ppo.actor.mean).bias.fill_(1.5)  # beyond the range of actions, where the penalty is
     learner = MultiAgentPPO(dataclasses.replace(BOTH[agent], **settings), *SIZES, 1000, ALONE)
     learner.actor.of("all").load_state_dict(ppo.actor.state_dict())
     learner.critic.load_state_dict(ppo.critic.state_dict())
