@@ -1,4 +1,4 @@
-"""A point mass on a plane that has to reach a goal: the task interface without a simulator."""
+"""Point masses on a plane that have to reach goals: the task interface without a simulator."""
 
 from typing import Any
 
@@ -49,11 +49,14 @@ class PointMass:
         if seeds is not None:
             self.generators = [np.random.default_rng(s) for s in seeds]
         index = options.get("env_idx", torch.arange(self.num_envs))
-        draws = torch.tensor(np.array([self.generators[i].uniform(-1, 1, 4) for i in index]), dtype=torch.float32)
-        draws = torch.full_like(draws, 0.5) if self.deterministic else draws
-        self.position[index], self.goal[index] = draws[:, :2] * 0.2, draws[:, 2:]
+        self.position[index], self.goal[index] = self.draw(index)
         self.elapsed_steps[index] = 0
         return self.observe(), {}
+
+    def draw(self, index: Any) -> tuple[Tensor, Tensor]:
+        draws = torch.tensor(np.array([self.generators[i].uniform(-1, 1, 4) for i in index]), dtype=torch.float32)
+        draws = torch.full_like(draws, 0.5) if self.deterministic else draws
+        return draws[:, :2] * 0.2, draws[:, 2:]
 
     def observe(self) -> Tensor:
         return torch.cat([self.position, self.goal], 1)
@@ -61,8 +64,8 @@ class PointMass:
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         self.elapsed_steps += 1
         self.position += STEP * action
-        distance = (self.position - self.goal).norm(dim=1)
-        near = distance < NEAR
+        gaps = self.gaps()
+        distance, near = gaps.mean(1), (gaps < NEAR).all(1)
         terms = {"reward/distance": -distance, "reward/reach": near.float()}
         fail = self.elapsed_steps == self.fail_at
         info = terms | {
@@ -75,8 +78,36 @@ class PointMass:
         }
         return self.observe(), terms["reward/distance"] + terms["reward/reach"], fail, fail & False, info
 
+    def gaps(self) -> Tensor:
+        return (self.position - self.goal).norm(dim=1, keepdim=True)
+
     def render(self) -> Tensor:
         return torch.full((1, 32, 32, 3), 128, dtype=torch.uint8)
 
     def close(self) -> None:
         self.closed = True
+
+
+class TwoPoints(PointMass):
+    """N pairs of points, each moved by an agent of its own; observation (N, 9) = positions, goals, time.
+
+    `left` sees and moves the first point, `right` the second one. The reward is common: the mean distance, and success,
+    which is that both are near their goals, so it takes both agents.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.agent_columns: Any = {"left": ([0, 1, 4, 5, 8], [0, 1]), "right": ([2, 3, 6, 7, 8], [2, 3])}
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self.position, self.goal = torch.zeros(self.num_envs, 4), torch.zeros(self.num_envs, 4)
+
+    def draw(self, index: Any) -> tuple[Tensor, Tensor]:
+        draws = torch.tensor(np.array([self.generators[i].uniform(-1, 1, 8) for i in index]), dtype=torch.float32)
+        draws = torch.full_like(draws, 0.5) if self.deterministic else draws
+        return draws[:, :4] * 0.2, draws[:, 4:]
+
+    def observe(self) -> Tensor:
+        return torch.cat([self.position, self.goal, self.elapsed_steps[:, None] / self.max_steps], 1)
+
+    def gaps(self) -> Tensor:
+        return (self.position - self.goal).unflatten(1, (2, 2)).norm(dim=-1)

@@ -18,7 +18,7 @@ from dora.agents.checkpoint import read_checkpoint
 from dora.agents.config import LEARNER_CONFIGS, config_from_dict
 from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed
 from dora.agents.evaluation.play import load_policy
-from dora.agents.runs.recommended import recommended
+from dora.agents.runs.recommended import learners_of, recommended
 from dora.agents.runs.run_folder import RunFolder
 from dora.commands import run
 from dora.configs import plain
@@ -50,7 +50,7 @@ def script() -> ModuleType:
         ("--env DoraCube-v1 --total-steps -5", "--total-steps is -5"),
         ("--env DoraCube-v1 --workers -1", "--workers is -1"),
         ("--env DoraCube-v1 --learner.noise-correlation 1", "--learner.noise-correlation is 1.0"),
-        ("--env DoraCube-v1 --agent mappo", "use --agent with one of ppo, sac"),
+        ("--env DoraCube-v1 --agent trpo", "use --agent with one of ppo, sac, mappo, happo"),
         ("--resume /nowhere", "not a run folder"),
         ("--eval-only", "--checkpoint"),
         ("--eval-only --zero-correction", "--env"),
@@ -123,7 +123,7 @@ def test_help_shows_the_defaults_of_the_chosen_task(words: str, capsys: pytest.C
     assert f"(default: {env})" in shown
     budget = "--total-steps INT Budget in environment steps, summed over all environments."
     assert f"{budget} (default: {learners[agent]['total_steps']})" in shown
-    assert "mappo" not in shown
+    assert f"{{{','.join(learners_of(learners))}}}" in shown
     assert "--task.weights.penetration" in shown
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from dora.agents.agent_columns import Agents, checked_agents, plain_agents
 from dora.agents.config import RunConfig, config_from_dict, stored_digests
 from dora.agents.limits import check
 from dora.configs import plain
@@ -35,6 +36,7 @@ class Checkpoint:
     tensors: flat names and values.
     progress: counters of the run (environment steps, seconds, best evaluation ...).
     config_digest: digest of the settings as it was written.
+    agents: columns of the agents that the learner tells apart, by name; none where one sees and commands everything.
     """
 
     config: RunConfig
@@ -42,6 +44,7 @@ class Checkpoint:
     tensors: dict[str, Tensor]
     progress: dict[str, Any] = field(default_factory=dict)
     config_digest: str = ""
+    agents: Agents = field(default_factory=dict)
 
     def write(self, path: Path) -> None:
         """Write atomically.
@@ -56,7 +59,7 @@ class Checkpoint:
             "config_digest": self.config.digest(),
             "sizes": json.dumps(self.sizes),
             "progress": json.dumps(self.progress),
-        }
+        } | ({"agents": json.dumps(plain_agents(self.agents))} if self.agents else {})
         write_safetensors(path, self.tensors, header)
 
 
@@ -85,7 +88,12 @@ def read_checkpoint(path: Path) -> Checkpoint:
         check(config)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    return Checkpoint(config, (sizes[0], sizes[1]), tensors, progress, header["config_digest"])
+    agents = checked_agents(
+        parse_json(header.get("agents", "{}"), f"agents of {path}"),
+        (sizes[0], sizes[1]),
+        f"the list of agents in {path}",
+    )
+    return Checkpoint(config, (sizes[0], sizes[1]), tensors, progress, header["config_digest"], agents)
 
 
 @contextlib.contextmanager
@@ -99,11 +107,22 @@ def whole(path: Path) -> Iterator[None]:
 
 
 def check_belongs(
-    checkpoint: Checkpoint, path: Path, config: RunConfig, sizes: tuple[int, int], *, exactly: bool
+    checkpoint: Checkpoint,
+    path: Path,
+    config: RunConfig,
+    sizes: tuple[int, int],
+    agents: Agents | None = None,
+    *,
+    exactly: bool,
 ) -> None:
     """Refuse a checkpoint of something else.
 
     Args:
+        checkpoint: what was read.
+        path: of it, for messages.
+        config: settings of the run in hand.
+        sizes: numbers of observation and action components of its task.
+        agents: that its learner tells apart.
         exactly: also every setting has to agree (for resuming), not only what the networks depend on.
 
     Raises:
@@ -117,6 +136,12 @@ def check_belongs(
     ]
     names = ("observation size", "action size")
     differences += [(n, a, b) for n, a, b in zip(names, checkpoint.sizes, sizes, strict=True) if a != b]
+    known, wanted = plain_agents(checkpoint.agents), plain_agents(agents or {})
+    if not differences and list(known) != list(wanted):
+        differences = [("agents", ", ".join(known) or "none", ", ".join(wanted) or "none")]
+    differences += [
+        (f"columns of {n}", shown(known[n]), shown(wanted[n])) for n in known if known[n] != wanted.get(n, known[n])
+    ]
     if exactly and not differences and theirs.digest() != ours.digest():
         differences = [("config digest", theirs.digest(), ours.digest())]
     if differences:

@@ -66,6 +66,16 @@ class PPOConfig:
 
 
 @dataclass(frozen=True)
+class MAPPOConfig(PPOConfig):
+    """PPO with an actor for each agent of the task and one critic that sees everything (Yu et al. 2022)."""
+
+
+@dataclass(frozen=True)
+class HAPPOConfig(PPOConfig):
+    """MAPPO whose agents learn one after the other, each from what those before it became (Kuba et al. 2022)."""
+
+
+@dataclass(frozen=True)
 class SACConfig:
     """Soft actor-critic (Haarnoja et al. 2018) with layer-normalised critics and learned temperature."""
 
@@ -109,7 +119,9 @@ class SACConfig:
 
 DIGITS = 12
 """Hexadecimal digits of a digest of settings."""
-LEARNER_CONFIGS: dict[str, type[PPOConfig] | type[SACConfig]] = {"ppo": PPOConfig, "sac": SACConfig}
+LEARNER_CONFIGS: dict[str, type[PPOConfig] | type[SACConfig]] = {
+    "ppo": PPOConfig, "sac": SACConfig, "mappo": MAPPOConfig, "happo": HAPPOConfig
+}  # fmt: skip
 """Settings of each learner."""
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Union
 import tyro
 
 from dora.agents.config import LEARNER_CONFIGS
-from dora.agents.runs.recommended import recommended
+from dora.agents.runs.recommended import learners_of, recommended
 from dora.commands import bench, demos, grasps, play, report, run, view
 from dora.tasks import find_task
 from dora.tasks.env.options import task_config
@@ -40,7 +40,7 @@ def _choice(forms: dict[str, Any]) -> Any:
 def _run() -> Any:
     """Options of `dora run`, those of the task that its help shows."""
     task, base = find_task(run.SHOWN), recommended(run.SHOWN)
-    agents = Literal[tuple(task.LEARNERS)]  # pyright: ignore[reportInvalidTypeForm]
+    agents = Literal[tuple(learners_of(task.LEARNERS))]  # pyright: ignore[reportInvalidTypeForm]
     form: Any = run.Args[task.CONFIG, LEARNER_CONFIGS[base.agent], agents]  # pyright: ignore[reportInvalidTypeArguments, reportInvalidTypeForm]
     return form
 

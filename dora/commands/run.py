@@ -30,7 +30,7 @@ from dora.agents.evaluation.play import checkpoint_path, evaluate_checkpoint, ev
 from dora.agents.limits import check
 from dora.agents.runs.interrupt import STATUS, ending_at_once
 from dora.agents.runs.logging import add_film
-from dora.agents.runs.recommended import recommended
+from dora.agents.runs.recommended import learners_of, recommended
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.agents.runs.trainer import Trainer
 from dora.configs import plain
@@ -88,7 +88,7 @@ def parse(words: Sequence[str]) -> Args[dict[str, Any], Any, str]:
     base = settings_to_start_from(words)
     task = find_task(base.env)
     numbers = task_config(task.CONFIG, base.preset, base.task)
-    agents = Literal[tuple(task.LEARNERS)]  # pyright: ignore[reportInvalidTypeForm]
+    agents = Literal[tuple(learners_of(task.LEARNERS))]  # pyright: ignore[reportInvalidTypeForm]
     form: Any = Args[task.CONFIG, LEARNER_CONFIGS[base.agent], agents]  # pyright: ignore[reportInvalidTypeArguments, reportInvalidTypeForm]
     default = Args(run=replace(base, task=numbers), zero_correction="--eval-only" not in words)
     args = tyro.cli(form, default=default, description=__doc__, args=list(words))

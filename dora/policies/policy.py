@@ -149,7 +149,7 @@ def traits(env: DoraEnv) -> dict[str, Any]:
     """What decides what the observations and actions of an environment mean, by name."""
     return {
         "guidance": _words(env.parts),
-        "control mode": env.control_mode,
+        "control mode": " and ".join(sorted({arm.agent.control_mode for arm in env.arms.values()})),
         "observation size": env.single_observation_space.shape[0],  # pyright: ignore[reportOptionalSubscript]
         "action size": env.action_size,
         **_meaning(plain(env.config)),

@@ -11,6 +11,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from dora.agents.agent_columns import AgentColumns, checked_agents
+
 
 @runtime_checkable
 class Task(Protocol):
@@ -22,7 +24,9 @@ class Task(Protocol):
     Success does not end an episode: it runs to `max_steps` unless it fails. Evaluation understands, if they are
     logged, `raw_success` (success without regard to overlap), `success_at_end` (success, and what was reached still
     holds now), `penetration_mm` and `nonfinite` (the simulator gave NaN or infinity; such an episode ends). A task may
-    have an attribute `ranking_steps`: simulated steps that ranking its candidates took.
+    have an attribute `ranking_steps`: simulated steps that ranking its candidates took; and `agent_columns`: by agent's
+    name, the columns of the observation that it sees, and those of the action that it commands, for learners that tell
+    agents apart. Without it, one agent sees and commands everything.
     """
 
     @property
@@ -171,6 +175,20 @@ class TaskEnv(EnvBase):
         self.action_spec = Bounded(self._low.expand(n, -1), self._high.expand(n, -1), device=device)
         self.reward_spec = Unbounded(torch.Size([n, 1]), device=device)
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,), device=device)
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Numbers of observation and action components."""
+        return self.observation_spec["observation"].shape[-1], self.action_spec.shape[-1]
+
+    @property
+    def agents(self) -> dict[str, AgentColumns]:
+        """The agents that the task names, with their columns; none if it names none.
+
+        Raises:
+            InputError: a column is none, or the actions of all agents are not each column of the action once.
+        """
+        return checked_agents(getattr(self.task, "agent_columns", {}), self.sizes, "agent_columns of the task")
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """What `EnvBase` does, for this environment's few keys: several times less Python per step."""

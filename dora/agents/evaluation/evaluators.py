@@ -40,7 +40,7 @@ class Evaluators:
         self._own, self._config = _Evaluator(make_task, config), config
         self._helpers = WorkerPool(_Evaluator, (make_task, config), max(config.workers, 1) - 1)
         self.env = self._own.env(min(episodes or config.eval_envs, config.eval_envs))
-        self.sizes = _sizes(self.env)
+        self.sizes, self.agents = self.env.sizes, self.env.agents
 
     def run(
         self, policy: Policy | None, episodes: int, first_seed: int, check: Callable[[], None] = lambda: None
@@ -104,7 +104,7 @@ class _Evaluator:
         """Rows (n, k) of an evaluation's table; `check` is called every control step."""
         weights, seed, episodes = batch
         env = self.env(episodes)
-        act = no_correction(_sizes(env)[1]) if weights is None else self._greedy(weights, _sizes(env))
+        act = no_correction(env.sizes[1]) if weights is None else self._greedy(weights, env)
 
         def checked(observation: Tensor) -> Tensor:
             check()
@@ -113,12 +113,12 @@ class _Evaluator:
         with torch.random.fork_rng(devices=[]):
             return run_batch(env, checked, seed)[:episodes].numpy(force=True)
 
-    def _greedy(self, weights: Weights, sizes: tuple[int, int]) -> Act:
+    def _greedy(self, weights: Weights, env: TaskEnv) -> Act:
         """The policy with these weights. It always computes `eval_envs` rows, because a matrix product of fewer rows
         is rounded otherwise, and contacts make much of it."""
         if self._policy is None:
             with torch.random.fork_rng(devices=[]):
-                self._policy = make_learner(self._config, *sizes).policy
+                self._policy = make_learner(self._config, *env.sizes, env.agents).policy
         policy = self._policy
         policy.load_state_dict({name: torch.from_numpy(value) for name, value in weights.items()})
 
@@ -133,8 +133,3 @@ class _Evaluator:
         """Close the environments."""
         for env in self._envs.values():
             env.close()
-
-
-def _sizes(env: TaskEnv) -> tuple[int, int]:
-    """Numbers of observation and action components."""
-    return env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]

@@ -16,7 +16,7 @@ from dora.agents.collecting.task_env import MakeTask, Task
 from dora.agents.config import RunConfig
 from dora.agents.evaluation.evaluate import FINAL_SEED, Act, Evaluation, no_correction
 from dora.agents.evaluation.evaluators import Evaluators
-from dora.agents.learners.learner import make_learner
+from dora.agents.learners.learner import agents_of, make_learner
 from dora.agents.learners.networks import Policy
 
 FRAMES_PER_SECOND = 20
@@ -34,7 +34,7 @@ def load_policy(checkpoint: Checkpoint, path: Path) -> Policy:
     Raises:
         InputError: if its tensors do not fit its settings.
     """
-    policy = make_learner(checkpoint.config, *checkpoint.sizes).policy
+    policy = make_learner(checkpoint.config, *checkpoint.sizes, checkpoint.agents).policy
     unpack_modules(policy.modules_by_name, checkpoint.tensors, path)
     return policy
 
@@ -67,7 +67,8 @@ def evaluate_checkpoint(
     settings = dataclasses.replace(config, learner=checkpoint.config.learner)
     evaluators = Evaluators(make_task, settings, config.final_episodes)
     try:
-        check_belongs(checkpoint, path, config, evaluators.sizes, exactly=False)
+        agents = agents_of(settings, evaluators.agents)
+        check_belongs(checkpoint, path, config, evaluators.sizes, agents, exactly=False)
         before()
         return checkpoint, *evaluators.final(load_policy(checkpoint, path), zero=zero, first_seed=first_seed)
     finally:

@@ -6,7 +6,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from dora.agents.config import PPOConfig, RunConfig
+from dora.agents.agent_columns import Agents
+from dora.agents.config import HAPPOConfig, MAPPOConfig, RunConfig, SACConfig
+from dora.agents.learners.multi_agent import MultiAgentPPO
 from dora.agents.learners.networks import Policy
 from dora.agents.learners.ppo import PPO
 from dora.agents.learners.replay import Replay
@@ -48,9 +50,24 @@ class Learner(Protocol):
         ...
 
 
-def make_learner(config: RunConfig, observation: int, action: int) -> Learner:
-    """The learner of a run, with weights drawn from torch's global generator."""
-    settings = config.learner
-    if isinstance(settings, PPOConfig):
-        return PPO(settings, observation, action, config.normaliser_samples)
-    return SAC(settings, observation, action, config.normaliser_samples)
+def agents_of(config: RunConfig, agents: Agents) -> Agents:
+    """The agents of a task that the learner of a run tells apart; none where one sees and commands everything."""
+    return agents if isinstance(config.learner, MAPPOConfig | HAPPOConfig) and len(agents) > 1 else {}
+
+
+def make_learner(config: RunConfig, observation: int, action: int, agents: Agents | None = None) -> Learner:
+    """The learner of a run, with weights drawn from torch's global generator.
+
+    Args:
+        config: settings of the run.
+        observation: number of observation components.
+        action: number of action components.
+        agents: of the task. MAPPO and HAPPO with less than two are PPO.
+    """
+    settings, several = config.learner, agents_of(config, agents or {})
+    sizes = observation, action, config.normaliser_samples
+    if isinstance(settings, SACConfig):
+        return SAC(settings, *sizes)
+    if several:
+        return MultiAgentPPO(settings, *sizes, several)
+    return PPO(settings, *sizes)

@@ -17,6 +17,8 @@ from tensordict.nn import (
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 
+from dora.agents.agent_columns import Agents
+
 CLIP = 6.0
 """Bound of normalised observations, in standard deviations [1]."""
 VARIANCE_FLOOR = 1e-4
@@ -103,6 +105,11 @@ class GaussianActor(nn.Module):
         mean = self.mean(features)
         return mean, self.log_std.exp().expand_as(mean)
 
+    @property
+    def action_size(self) -> int:
+        """Number of action components."""
+        return self.log_std.shape[0]
+
     def act(
         self, features: Float[Tensor, "n o"], noise: Float[Tensor, "n a"] | None
     ) -> tuple[Float[Tensor, "n a"], Float[Tensor, " n"]]:
@@ -133,6 +140,11 @@ class TanhActor(nn.Module):
         mean, raw = self.net(features).chunk(2, -1)
         return mean, (self.log_std_max - nn.functional.softplus(-raw)).clamp_min(LOG_STD_MIN).exp()
 
+    @property
+    def action_size(self) -> int:
+        """Number of action components."""
+        return last_layer(self.net).out_features // 2
+
     def act(
         self, features: Float[Tensor, "n o"], noise: Float[Tensor, "n a"] | None
     ) -> tuple[Float[Tensor, "n a"], Float[Tensor, " n"]]:
@@ -143,6 +155,46 @@ class TanhActor(nn.Module):
         action = (mean + std * noise).tanh()
         jacobian = (1 - action.square() + TANH_MARGIN).log().sum(-1)
         return action, _log_normal(noise, std) - jacobian
+
+
+class JointActor(nn.Module):
+    """An actor for each agent of a task: each sees its columns of the observation and gives its columns of the action.
+
+    Args:
+        agents: columns of each agent, by name.
+        hidden: widths of the hidden layers of each actor.
+        log_std: first logarithm of the exploration noise.
+    """
+
+    def __init__(self, agents: Agents, hidden: Sequence[int], log_std: float):
+        super().__init__()
+        self.agents = dict(agents)
+        self.actors = nn.ModuleDict(
+            {name: GaussianActor(len(c.observation), len(c.action), hidden, log_std) for name, c in agents.items()}
+        )
+
+    def of(self, name: str) -> GaussianActor:
+        """The actor of an agent."""
+        actor = self.actors[name]
+        assert isinstance(actor, GaussianActor)
+        return actor
+
+    @property
+    def action_size(self) -> int:
+        """Number of action components, of all agents."""
+        return sum(len(columns.action) for columns in self.agents.values())
+
+    def act(
+        self, features: Float[Tensor, "n o"], noise: Float[Tensor, "n a"] | None
+    ) -> tuple[Float[Tensor, "n a"], Float[Tensor, "n agents"]]:
+        """Joint action, and the log probability of each agent's part; without noise the means."""
+        action, log_probs = features.new_zeros(len(features), self.action_size), []
+        for name, columns in self.agents.items():
+            mine = list(columns.action)
+            own = None if noise is None else noise[:, mine]
+            action[:, mine], log_prob = self.of(name).act(features[:, list(columns.observation)], own)
+            log_probs.append(log_prob)
+        return action, torch.stack(log_probs, -1)
 
 
 class Critic(nn.Module):
@@ -165,9 +217,13 @@ class Policy(TensorDictModuleBase):
     `action_log_prob`. With `noise_correlation` c > 0 the noise is e_t = c e_(t-1) + sqrt(1 - c^2) x_t,
     whose marginal is standard normal; the log probability is that of the marginal, an approximation
     (as in Hollenstein et al. 2024, Colored Noise in PPO) that ignores what the previous noise tells.
+
+    `action_log_prob` is (n,), or (n, agents) of an actor for each agent.
     """
 
-    def __init__(self, normaliser: Normaliser, actor: GaussianActor | TanhActor, noise_correlation: float = 0.0):
+    def __init__(
+        self, normaliser: Normaliser, actor: GaussianActor | TanhActor | JointActor, noise_correlation: float = 0.0
+    ):
         super().__init__()
         self.in_keys, self.out_keys = ["observation"], ["action", "action_log_prob"]
         self.normaliser, self.actor, self.noise_correlation = normaliser, actor, noise_correlation
@@ -206,9 +262,7 @@ class Policy(TensorDictModuleBase):
     @property
     def action_size(self) -> int:
         """Number of action components."""
-        if isinstance(self.actor, GaussianActor):
-            return self.actor.log_std.shape[0]
-        return last_layer(self.actor.net).out_features // 2
+        return self.actor.action_size
 
 
 def for_loss(actor: nn.Module, distribution: type) -> ProbabilisticTensorDictSequential:

@@ -90,7 +90,7 @@ class PPO:
         if self.normaliser.count == 0:
             self.normaliser.update(batch["observation"])
             return {}
-        data = self._prepare(batch)
+        data = transitions(batch, self.normaliser, self.critic, self.config)
         losses: list[Tensor] = []
         divergences: list[Tensor] = []
         for _ in range(self.config.epochs):
@@ -100,7 +100,7 @@ class PPO:
                 losses.append(values)
                 divergences.append(values[-1])
         divergence = float(torch.stack(divergences).mean())
-        self._adapt(divergence)
+        self.set_learning_rate(adapted(self.learning_rate, divergence, self.config))
         means = torch.stack(losses).mean(0).tolist()
         self.normaliser.update(batch["observation"])
         names = ("policy", "value", "entropy", "bound", "clip_fraction", "grad_norm")
@@ -111,40 +111,11 @@ class PPO:
             "explained_variance": float(data["explained"][0]),
         }
 
-    @torch.no_grad()
-    def _prepare(self, batch: TensorDictBase) -> TensorDict:
-        """Flatten a batch (N, T) into transitions with normalised observations and advantages."""
-        features = self.normaliser(batch["observation"])
-        following = self.normaliser(batch["next", "observation"])
-        value, next_value = self.critic(features), self.critic(following)
-        advantage, target = advantages(
-            self.config.gamma,
-            self.config.gae_lambda,
-            value,
-            next_value,
-            batch["next", "reward"] * (1 - self.config.gamma),
-            batch["next", "done"],
-            batch["next", "terminated"],
-        )
-        explained = 1 - (target - value).var() / target.var().clamp_min(ADVANTAGE_FLOOR)
-        return TensorDict(
-            {
-                "features": features,
-                "action": batch["action"],
-                "action_log_prob": batch["action_log_prob"],
-                "advantage": advantage,
-                "value_target": target,
-                "explained": explained.expand_as(value[..., 0]),
-            },
-            batch_size=batch.shape,
-        ).flatten()
-
     def _step(self, minibatch: TensorDict) -> Float[Tensor, " 7"]:
         """One gradient step; returns the losses, the gradient's norm and the divergence."""
-        advantage = minibatch["advantage"]
-        minibatch["advantage"] = (advantage - advantage.mean()) / (advantage.std() + ADVANTAGE_FLOOR)
+        minibatch["advantage"] = standardised(minibatch["advantage"])
         out = self.loss(minibatch)
-        bound = (self._mean.abs() - 1).clamp_min(0).square().sum(-1).mean()
+        bound = excess(self._mean)
         total = out["loss_objective"] + out["loss_entropy"] + out["loss_critic"] + self.config.bound * bound
         check_loss("loss", total)
         self.optimiser.zero_grad()
@@ -164,13 +135,53 @@ class PPO:
         """Forward hook: `ClipPPOLoss` hides the distribution whose mean the bound penalty needs."""
         self._mean = outputs[0]
 
-    def _adapt(self, divergence: float) -> None:
-        config, rate = self.config, self.learning_rate
-        if divergence > config.target_kl * KL_BAND:
-            rate = max(rate / LEARNING_RATE_DOWN, config.learning_rate_min)
-        elif divergence < config.target_kl / KL_BAND:
-            rate = min(rate * LEARNING_RATE_UP, config.learning_rate_max)
-        self.set_learning_rate(rate)
+
+@torch.no_grad()
+def transitions(batch: TensorDictBase, normaliser: Normaliser, critic: Critic, config: PPOConfig) -> TensorDict:
+    """A batch (N, T) as transitions (B,) with normalised observations, advantages and targets of the value."""
+    features = normaliser(batch["observation"])
+    following = normaliser(batch["next", "observation"])
+    value, next_value = critic(features), critic(following)
+    advantage, target = advantages(
+        config.gamma,
+        config.gae_lambda,
+        value,
+        next_value,
+        batch["next", "reward"] * (1 - config.gamma),
+        batch["next", "done"],
+        batch["next", "terminated"],
+    )
+    explained = 1 - (target - value).var() / target.var().clamp_min(ADVANTAGE_FLOOR)
+    return TensorDict(
+        {
+            "features": features,
+            "action": batch["action"],
+            "action_log_prob": batch["action_log_prob"],
+            "advantage": advantage,
+            "value_target": target,
+            "explained": explained.expand_as(value[..., 0]),
+        },
+        batch_size=batch.shape,
+    ).flatten()
+
+
+def standardised(advantage: Float[Tensor, "b 1"]) -> Float[Tensor, "b 1"]:
+    """Advantages with mean 0 and deviation 1."""
+    return (advantage - advantage.mean()) / (advantage.std() + ADVANTAGE_FLOOR)
+
+
+def excess(mean: Float[Tensor, "*b a"]) -> Float[Tensor, ""]:
+    """Mean over the transitions of the squared excess of mean actions over [-1, 1]."""
+    return (mean.abs() - 1).clamp_min(0).square().sum(-1).mean()
+
+
+def adapted(rate: float, divergence: float, config: PPOConfig) -> float:
+    """The next learning rate, from the present one and the divergence [nats] that it led to."""
+    if divergence > config.target_kl * KL_BAND:
+        return max(rate / LEARNING_RATE_DOWN, config.learning_rate_min)
+    if divergence < config.target_kl / KL_BAND:
+        return min(rate * LEARNING_RATE_UP, config.learning_rate_max)
+    return rate
 
 
 def advantages(

@@ -37,6 +37,8 @@ TAGS: dict[str, str] = {
     "loss/policy": "PPO: clipped surrogate objective, negative",
     "loss/value": "PPO: squared error of the value times its weight",
     "loss/bound": "PPO: mean squared excess of mean actions over [-1, 1], without its weight",
+    "loss/policy/<agent>": "MAPPO, HAPPO: the same of the agent's actor",
+    "loss/bound/<agent>": "MAPPO, HAPPO: the same of the agent's mean actions",
     "loss/qvalue": "SAC: squared Bellman error, summed over both critics",
     "loss/actor": "SAC: temperature times log probability minus the smaller critic, without the prior's share",
     "learner/entropy": "entropy of the policy [nats]",
@@ -47,6 +49,8 @@ TAGS: dict[str, str] = {
     "learner/action_std": "mean standard deviation of the exploration noise (SAC: before the tanh)",
     "learner/correction": "SAC: root mean square of the mean action over the batch",
     "learner/explained_variance": "PPO: 1 - Var(target - value) / Var(target); 1 is perfect",
+    "learner/factor_std/<agent>": "HAPPO: deviation of the compounded ratio by which its advantages are multiplied",
+    "learner/<value>/<agent>": "MAPPO, HAPPO: entropy, kl, clip_fraction, learning_rate, grad_norm, action_std of one",
     "learner/alpha": "SAC: temperature",
     "learner/updates": "SAC: gradient steps so far",
     "learner/replay": "SAC: transitions in the replay buffer",
@@ -110,7 +114,8 @@ class RunLog:
     def add_learner(self, values: Mapping[str, float], step: int) -> None:
         """Write what a learner's update returned: losses and the rest."""
         for name, value in values.items():
-            self._writer.add_scalar(f"{'loss' if name in LOSSES else 'learner'}/{name}", value, step)
+            kind = "loss" if name.partition("/")[0] in LOSSES else "learner"
+            self._writer.add_scalar(f"{kind}/{name}", value, step)
 
     def add_final(self, result: Mapping[str, Any], step: int) -> None:
         """Write the figures of a finished run's `result.json` that stand beside its settings."""

@@ -14,6 +14,17 @@ WITHOUT_PRIOR: dict[str, dict[str, Any]] = {"sac": {"prior": 0.0}}
 """Settings of each learner where actions are no residuals and zero action is no prior to be pulled to."""
 ALL: Mapping[str, Mapping[str, Any]] = {name: {} for name in LEARNER_CONFIGS}
 """The learners of a task that recommends nothing."""
+LIKE_PPO = ("mappo", "happo")
+"""Learners that can do what PPO can, with what a task recommends for PPO unless it names them itself."""
+
+
+def learners_of(table: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    """The learners that can do a task with what it recommends for each, the recommended one first.
+
+    Args:
+        table: those that the task names itself.
+    """
+    return {**table, **{name: table["ppo"] for name in LIKE_PPO if "ppo" in table and name not in table}}
 
 
 def recommended(
@@ -31,6 +42,7 @@ def recommended(
     Raises:
         InputError: if the task cannot be done by the learner, or a value makes no sense.
     """
+    learners = learners_of(learners)
     agent = agent or next(iter(learners))
     if agent not in learners:
         raise InputError(f"{env} cannot be learned by {agent!r}: use --agent with one of {', '.join(learners)}.")

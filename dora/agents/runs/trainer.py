@@ -1,4 +1,4 @@
-"""The training loop that PPO and SAC share."""
+"""The training loop that all learners share."""
 
 import functools
 import os
@@ -31,7 +31,7 @@ from dora.agents.config import RunConfig
 from dora.agents.evaluation.evaluate import PERIODIC_SEED, Evaluation, outcome
 from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.finite import check_modules, check_tensors
-from dora.agents.learners.learner import Learner, make_learner
+from dora.agents.learners.learner import Learner, agents_of, make_learner
 from dora.agents.runs.interrupt import Interrupt
 from dora.agents.runs.logging import RunLog
 from dora.agents.runs.progress_table import ProgressTable
@@ -105,7 +105,8 @@ class Trainer:
         self.sizes = self._evaluators.sizes
         weights_seed, self._exploration_seed = seeds_for(config.seed, 0, 2)
         torch.manual_seed(weights_seed)
-        self.learner: Learner = make_learner(config, *self.sizes)
+        self.agents = agents_of(config, self._evaluators.agents)
+        self.learner: Learner = make_learner(config, *self.sizes, self.agents)
         torch.manual_seed(self._exploration_seed)
         self._recent = torch.zeros(0, len(self.columns.names))
         self._resumed: dict[str, Tensor] | None = None
@@ -306,7 +307,7 @@ class Trainer:
         if not self.folder.best.exists():
             self._keep_as_best()
         with torch.random.fork_rng(devices=[]):  # networks of its own: those that learn stay as they are
-            policy = make_learner(self.config, *self.sizes).policy
+            policy = make_learner(self.config, *self.sizes, self.agents).policy
         best = read_checkpoint(self.folder.best)
         unpack_modules(policy.modules_by_name, best.tensors, self.folder.best)
         evaluation, zero = self._evaluators.final(policy, interrupt.check, zero=self._zero)
@@ -331,12 +332,12 @@ class Trainer:
 
     def _checkpoint(self, tensors: dict[str, Tensor]) -> Checkpoint:
         progress = dict(vars(self.counters)) | {"learner": self.learner.counters()}
-        return Checkpoint(self.config, self.sizes, tensors, progress)
+        return Checkpoint(self.config, self.sizes, tensors, progress, agents=self.agents)
 
     def _load(self) -> None:
         path = self.folder.latest
         checkpoint = read_checkpoint(path)
-        check_belongs(checkpoint, path, self.config, self.sizes, exactly=True)
+        check_belongs(checkpoint, path, self.config, self.sizes, self.agents, exactly=True)
         unpack_modules(self.learner.modules, checkpoint.tensors, path)
         progress = dict(checkpoint.progress)
         with whole(path):

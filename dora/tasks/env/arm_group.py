@@ -3,7 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
+from gymnasium.spaces import Box
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -11,6 +13,7 @@ from dora.arguments import as_tensor
 from dora.errors import InputError
 from dora.tasks.env.arm import Arm
 from dora.tasks.guidance.candidate_choice import CandidateChoice
+from dora.tasks.mdp.observations import Entry, columns_by_arm
 from dora.tasks.mdp.snapshot import Snapshot
 
 
@@ -32,6 +35,23 @@ class ArmGroup(dict[str, Arm]):
     def action_size(self) -> int:
         """Number of action components."""
         return sum(arm.action_size for arm in self.values())
+
+    def action_spaces(self, num_envs: int) -> tuple[Box, Box]:
+        """The space of one action for all arms, and that of a batch of them, which for one environment is the same."""
+        bound = np.ones((num_envs, self.action_size), np.float32)
+        single = Box(-bound[0], bound[0])
+        return single, Box(-bound, bound) if num_envs > 1 else single
+
+    def columns(self, entries: Mapping[str, Entry], observed: Snapshot) -> dict[str, tuple[list[int], list[int]]]:
+        """Columns of the observation that each arm sees, and columns of the action that it commands.
+
+        Args:
+            entries: the table of the observation.
+            observed: a state, whose entries have the sizes of all.
+        """
+        seen = columns_by_arm(list(self), {name: entry.value(observed).shape[-1] for name, entry in entries.items()})
+        parts = torch.arange(self.action_size).split([arm.action_size for arm in self.values()])
+        return {name: (seen[name], part.tolist()) for name, part in zip(self, parts, strict=True)}
 
     @property
     def out_of_reach(self) -> Bool[Tensor, " n"]:

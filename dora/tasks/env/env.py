@@ -9,10 +9,8 @@ from types import MappingProxyType
 from typing import Any, ClassVar, cast
 
 import gymnasium as gym
-import numpy as np
 import sapien
 import torch
-from gymnasium import spaces
 from jaxtyping import Bool, Float, Int
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
@@ -47,8 +45,7 @@ class DoraEnv(BaseEnv):
     Args:
         guidance: "affordance" puts candidates and regions into observation, reward and action, "grasps" candidates of a
             search that knows no region, "none" neither; see `dora.tasks.mdp.guidance_parts`.
-        guidance_parts: which parts of guidance are in force, among "observation", "reward", "filter"
-            and "prior"; all by default.
+        guidance_parts: the parts in force, among "observation", "reward", "filter" and "prior"; all by default.
         hand_joints: 20 independent hand targets, or 15 with distal joints coupled to medial ones.
         preset: how much episodes are randomised, see `dora.tasks.mdp.randomisation`.
         config: numbers that differ from the task's own, by name (nested for weights and randomisation), or all of
@@ -120,9 +117,7 @@ class DoraEnv(BaseEnv):
             **kwargs,
         )
         if several:  # one action for all arms, as learners want it
-            bound = np.ones((num_envs, self.action_size), np.float32)
-            self.single_action_space = spaces.Box(-bound[0], bound[0])
-            self.action_space = spaces.Box(-bound, bound) if num_envs > 1 else self.single_action_space
+            self.single_action_space, self.action_space = self.arms.action_spaces(num_envs)
 
     # ------------------------------------------------------------------- scene
 
@@ -362,6 +357,11 @@ class DoraEnv(BaseEnv):
     def max_steps(self) -> int:
         """Episode limit [control steps]."""
         return self.task.MAX_STEPS
+
+    @property
+    def agent_columns(self) -> dict[str, tuple[list[int], list[int]]]:
+        """Columns of observation and action of each arm, for learners that tell agents apart."""
+        return self.arms.columns(self.observation_entries, self.observed)
 
     @property
     def ranking_steps(self) -> int | None:

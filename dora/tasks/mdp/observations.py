@@ -88,6 +88,23 @@ def joined(entries: Mapping[str, Entry], parts: Mapping[str, Mapping[str, Tensor
     return torch.cat([values[name] for name in entries], -1)
 
 
+def columns_by_arm(arms: Sequence[str], sizes: Mapping[str, int]) -> dict[str, list[int]]:
+    """Columns of the observation vector that each arm sees: its own entries, and those that are the same for all.
+
+    Args:
+        arms: names of the arms.
+        sizes: number of components of each entry, in the order of the table.
+    """
+    columns: dict[str, list[int]] = {arm: [] for arm in arms}
+    start = 0
+    for name, size in sizes.items():
+        owner = name.partition("/")[0]
+        for arm in [owner] if owner in columns and "/" in name else arms:
+            columns[arm] += range(start, start + size)
+        start += size
+    return columns
+
+
 def _as_observed_by(arm: str, entry: Entry) -> Callable[[Any], Tensor]:
     return lambda s: entry.value(s.of(arm))
 
