@@ -58,6 +58,13 @@ class ArmGroup(dict[str, Arm]):
         """No candidate of some arm could be reached when the episode began."""
         return torch.stack([choice.buffers.reachable == 0 for choice in self.choices.values()]).any(0)
 
+    @property
+    def ranking_steps(self) -> int | None:
+        """Control steps that ranking the candidates took, those of all arms being ranked in the same episodes; None if
+        those of no arm say."""
+        known = [choice.candidates.ranking_steps for choice in self.choices.values()]
+        return max((steps for steps in known if steps is not None), default=None)
+
     def anneal(self, **shares: float) -> None:
         """As `Guide.anneal`, for every arm."""
         for arm in self.values():

@@ -100,8 +100,8 @@ class DoraEnv(BaseEnv):
             guidance, guidance_parts, hand_joints, task_config(self.TASK.CONFIG, preset, config), robot_uids,
             self.TASK.robots(), num_envs, control_mode, sim_backend, render_backend, render_mode, obs_mode,
         )  # fmt: skip
-        self._grasps = check_grasps(grasps, tuple(self.TASK.ARMS))
         self.parts, self.config = options.parts, options.config
+        self._grasps = check_grasps(grasps, tuple(self.TASK.ARMS))
         self.task, several = self.TASK(self.config), len(options.robots) > 1
         self._shares, self._tables = dict[str, float](), dict[str, ReachTable]()
         self._forced_scale: Tensor | None = None
@@ -178,14 +178,13 @@ class DoraEnv(BaseEnv):
 
     @property
     def arms(self) -> ArmGroup:
-        """The arms by name."""
+        """By name."""
         return self.task_scene.arms
 
     @cached_property
     def segmentation_id_map(self) -> dict[int, Any]:
         """The objects and links by their numbers in pictures of segmentation, which are the same in all rows."""
-        own = {body._bodies[0].entity.per_scene_id: body for body in self.objects.values()}
-        return {**super().segmentation_id_map, **own}
+        return {**super().segmentation_id_map, **{o._bodies[0].entity.per_scene_id: o for o in self.objects.values()}}
 
     @property
     def target_object(self) -> Actor | Link:
@@ -208,11 +207,7 @@ class DoraEnv(BaseEnv):
         return self.arms.action_size
 
     def anneal(self, **shares: float) -> None:
-        """Sets shares in [0, 1] for curricula, kept from now on: `bounds` of the residual, `error` of the candidates.
-
-        Raises:
-            InputError: for a share outside [0, 1].
-        """
+        """Sets shares for curricula, as `Guide.anneal`, and keeps them at reconfigurations."""
         self._shares |= shares
         self.arms.anneal(**shares)
 
@@ -365,8 +360,8 @@ class DoraEnv(BaseEnv):
 
     @property
     def ranking_steps(self) -> int | None:
-        """Control steps that ranking the candidates took; None if they do not say or there are several arms."""
-        return self.guide.choice.candidates.ranking_steps if len(self.arms) == 1 else None
+        """Control steps that ranking the candidates took; None if they do not say."""
+        return self.arms.ranking_steps
 
     @property
     def stage_names(self) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """f_reach of the microwave task: which candidates an arm can carry through, wherever the microwave stands.
 
-The wrist's way is fixed to the microwave: before the handle and along the arc of the door, or in front of the cavity and
-into it with the fingers ahead. Inverse kinematics follows that way from the arm's start posture, for microwaves at the
+The wrist's way is fixed to the microwave: before the handle and along the arc of the door, or in front of the cavity
+and into it with the fingers ahead. Inverse kinematics follows that way from the arm's start posture, for microwaves at the
 nodes of a grid; an episode looks at the node nearest to its own.
 """
 
@@ -61,7 +61,7 @@ def oven_reach(
     spread: float,
     turn: float,
 ) -> OvenReach:
-    """Follows the way of every candidate of an arm for microwaves around `centre` [m], +-`spread` [m], +-`turn` [rad]."""
+    """Follows the way of every candidate of an arm, for microwaves within `spread` [m] and `turn` [rad] of `centre`."""
 
     def nodes(half: float, count: int) -> Tensor:
         return torch.linspace(-half, half, count) if half > 0 else torch.zeros(1)

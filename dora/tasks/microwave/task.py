@@ -45,6 +45,12 @@ BLUE = (0.20, 0.42, 0.75, 1.0)
 CLASSES = {LEFT: "HandleGrasp", RIGHT: "BodyGrasp"}
 """The grasp classes of the candidates of each arm."""
 
+RECOMMENDED: dict[str, Any] = {
+    "total_steps": 600_000, "stop_success": 0.97, "num_envs": 64, "eval_every": 100_000, "eval_episodes": 100,
+    "eval_envs": 50, "learner": {"rollout": 24, "log_std": -1.8},
+}  # fmt: skip
+"""Settings of every learner of this task."""
+
 
 @register_task("DoraMicrowave-v1")
 class MicrowaveTask(Task):
@@ -78,12 +84,7 @@ class MicrowaveTask(Task):
         "hand_camera": HAND_CAMERA,
         "front_camera": CameraSpec(eye=(-0.25, -0.75, 0.85), target=(0.6, -0.05, 0.2), fov=1.0),
     }
-    LEARNERS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "ppo": {
-            "total_steps": 600_000, "stop_success": 0.97, "num_envs": 64, "eval_every": 150_000, "eval_episodes": 50,
-            "eval_envs": 50, "learner": {"rollout": 32, "log_std": -1.8},
-        },
-    }  # fmt: skip
+    LEARNERS: ClassVar[Mapping[str, Mapping[str, Any]]] = {agent: RECOMMENDED for agent in ("happo", "mappo", "ppo")}
 
     oven: HingedObject
 
