@@ -25,9 +25,10 @@ def reference(*waypoints: Waypoint, n: int = 2) -> WaypointReference:
     return made
 
 
-def state(n: int = 2, **given: Tensor) -> Snapshot:
-    fields = {"goal_pregrasp": torch.zeros(n, 20), "goal_grasp": torch.ones(n, 20)}
-    return invented(n, **(fields | given))
+def state(**given: Tensor) -> Snapshot:
+    """A state of two environments."""
+    fields = {"goal_pregrasp": torch.zeros(2, 20), "goal_grasp": torch.ones(2, 20)}
+    return invented(2, **(fields | given))
 
 
 def follow(made: WaypointReference, steps: int, blocked: bool = False, **given: Tensor) -> list[int]:

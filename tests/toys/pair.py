@@ -84,5 +84,5 @@ class PairTask(Task):
             obj = arm.spec.object
             column = list(scene.objects).index(obj)
             height = load_object(obj).support * scene.scale[rows, column]
-            pose = standing(numbers, height, self.start_grid(name), partial(self.reachable, arm))
+            pose = standing(numbers, height, self.start_grid(name), partial(self.graspable, arm))
             scene.objects[obj].set_pose(Pose.create_from_pq(*pose))

@@ -14,7 +14,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
-from mani_skill.utils.structs import Actor, Link
 from mani_skill.utils.structs.types import SimConfig
 from torch import Tensor
 
@@ -172,8 +171,8 @@ class DoraEnv(BaseEnv):
         return self.task_scene.scale
 
     @property
-    def objects(self) -> dict[str, Actor | Link]:
-        """The objects by name."""
+    def objects(self) -> dict[str, Any]:
+        """The objects by name: actors, or links of what they are mounted on."""
         return self.task_scene.objects
 
     @property
@@ -187,7 +186,7 @@ class DoraEnv(BaseEnv):
         return {**super().segmentation_id_map, **{o._bodies[0].entity.per_scene_id: o for o in self.objects.values()}}
 
     @property
-    def target_object(self) -> Actor | Link:
+    def target_object(self) -> Any:
         """The only object; ValueError if there are several."""
         return self.task_scene.object
 

@@ -132,7 +132,7 @@ def check_grasps(grasps: Any, arms: Sequence[str]) -> dict[str, GraspCandidates]
 def _robots(robot_uids: Any, arms: Sequence[str]) -> tuple[str, ...]:
     """Names of the robots of all arms, registered with ManiSkill; one name stands for all, and None for the task's own,
     `arms`."""
-    chosen = arms if robot_uids is None else robot_uids
+    chosen: Any = arms if robot_uids is None else robot_uids
     names = chosen if isinstance(chosen, tuple | list) else (chosen,) * len(arms)
     known = ", ".join(available_robots())
     if len(names) != len(arms):

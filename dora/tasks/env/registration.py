@@ -38,8 +38,8 @@ def register_task(env_id: str) -> Callable[[type[Task]], type[Task]]:
     def register(task: type[Task]) -> type[Task]:
         """Makes and registers the environment class of a task, which is returned unchanged."""
         name = task.__name__.removesuffix("Task") + "Env"
-        robots = tuple(task.robots())
-        supported = [robots if len(robots) > 1 else robots[0]]
+        robots: list[str] = task.robots()
+        supported = [tuple(robots)] if len(robots) > 1 else robots
         members = {"TASK": task, "__doc__": task.__doc__, "__module__": task.__module__, "SUPPORTED_ROBOTS": supported}
         env = type(name, (DoraEnv,), members)
         register_env(env_id, max_episode_steps=task.MAX_STEPS)(env)

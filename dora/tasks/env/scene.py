@@ -47,7 +47,7 @@ class TaskScene:
 
     Attributes:
         table: the table, whose upper face is z = 0.
-        objects, arms: by name.
+        objects, arms: by name; an object is an actor, or a link of what it is mounted on.
         halves: half extents of each object's bounding box (n, 3) [m].
         reader: reads the simulator.
     """
@@ -63,7 +63,7 @@ class TaskScene:
         self.scene, self.num_envs, self.config, self.scale = scene, num_envs, config, scale
         self.device = torch.device(scene.device)
         self.table = add_table(scene, table)
-        self.objects: dict[str, Actor | Link] = {}
+        self.objects: dict[str, Any] = {}
         self.halves: dict[str, Float[Tensor, "n 3"]] = {}
         self._properties: dict[str, ObjectProperties] = {}
         self.arms = ArmGroup()
@@ -96,7 +96,7 @@ class TaskScene:
         self._properties[name] = ObjectProperties(actor)
 
     @property
-    def object(self) -> Actor | Link:
+    def object(self) -> Any:
         """The only object; ValueError if there are several."""
         (only,) = self.objects.values()
         return only

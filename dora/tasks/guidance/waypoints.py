@@ -75,6 +75,23 @@ class _Progress:
     lost: Bool[Tensor, "n k"]
 
 
+def _phase(waypoints: Sequence[Waypoint], k: int) -> Stage[_Progress]:
+    """Waypoint k as a phase; the last one never ends."""
+
+    def none(t: _Progress) -> Tensor:
+        return torch.zeros(len(t.arrived), device=t.arrived.device)
+
+    def arrived(t: _Progress) -> Tensor:
+        return t.arrived[:, k] & (k < len(waypoints) - 1)
+
+    def lost(t: _Progress) -> Tensor:
+        return t.lost[:, k]
+
+    if k == 0 or waypoints[k].lost is None:
+        return Stage(waypoints[k].name, none, arrived)
+    return Stage(waypoints[k].name, none, arrived, lost=lost, back_to=waypoints[0].name)
+
+
 class WaypointReference(Reference):
     """Follows a list of waypoints.
 
@@ -95,15 +112,7 @@ class WaypointReference(Reference):
         closing_time: float = 0.6,
     ):
         self.waypoints, self.closing_time = tuple(waypoints), closing_time
-        last = len(waypoints) - 1
-        phases = [
-            Stage(
-                w.name, lambda t: torch.zeros(len(t.arrived)), lambda t, k=k: t.arrived[:, k] & (k < last),
-                lost=None if w.lost is None or k == 0 else (lambda t, k=k: t.lost[:, k]),
-                back_to=None if w.lost is None or k == 0 else waypoints[0].name,
-            )
-            for k, w in enumerate(waypoints)
-        ]  # fmt: skip
+        phases = [_phase(waypoints, k) for k in range(len(waypoints))]
         super().__init__(
             phases, num_envs, dt, device,
             ahead_p=(3,), ahead_q=(4,), target_p=(3,), target_q=(4,), closing=(), waited=(),

@@ -1,8 +1,8 @@
 """f_reach of the microwave task: which candidates an arm can carry through, wherever the microwave stands.
 
 The wrist's way is fixed to the microwave: before the handle and along the arc of the door, or in front of the cavity
-and into it with the fingers ahead. Inverse kinematics follows that way from the arm's start posture, for microwaves at the
-nodes of a grid; an episode looks at the node nearest to its own.
+and into it with the fingers ahead. Inverse kinematics follows that way from the arm's start posture, for microwaves at
+the nodes of a grid; an episode looks at the node nearest to its own.
 """
 
 import math
@@ -72,10 +72,10 @@ def oven_reach(
     spin = torch.zeros_like(p)
     spin[:, 2] = grid[:, 2]
     poses = way(candidates.to("cpu"), p, quaternion_from_rotation_vector(spin))
-    base = tuple(torch.tensor(x) for x in (arm.spec.position, arm.spec.quaternion))
+    base_p, base_q = torch.tensor(arm.spec.position), torch.tensor(arm.spec.quaternion)
     kinematics = InverseKinematics(arm.agent.description, arm.posture.arm)
     count = len(p) * len(candidates)
-    local = [relative((base[0].expand(count, 3), base[1].expand(count, 4)), (x.flatten(0, 1), q.flatten(0, 1)))
+    local = [relative((base_p.expand(count, 3), base_q.expand(count, 4)), (x.flatten(0, 1), q.flatten(0, 1)))
              for x, q in poses]  # fmt: skip
     position, quaternion = (torch.stack([pose[k] for pose in local], 1) for k in (0, 1))
     start = torch.tensor(arm.posture.arm, dtype=torch.float32).expand(count, -1)
@@ -106,9 +106,9 @@ def opening_way(hinge: Pose, handle: Pose, back: float, target: float) -> Way:
     def way(candidates: GraspCandidates, p: Tensor, q: Tensor) -> list[Pose]:
         def at(angle: float) -> Pose:
             spin = torch.tensor([0.0, 0.0, -angle]).expand(len(p), 3)
-            door = compose((p, q), tuple(x.expand(len(p), -1) for x in hinge))
+            door = compose((p, q), (hinge[0].expand(len(p), 3), hinge[1].expand(len(p), 4)))
             door = door[0], quaternion_multiply(door[1], quaternion_from_rotation_vector(spin))
-            return compose(door, tuple(x.expand(len(p), -1) for x in handle))
+            return compose(door, (handle[0].expand(len(p), 3), handle[1].expand(len(p), 4)))
 
         shut = at(0.0)
         wrist = each(shut, candidates)

@@ -14,11 +14,12 @@ from torch import Tensor
 
 from dora.affordance.bundled_sets import best_candidates
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.objects.articulation import load_mount
+from dora.affordance.objects.articulation import Mount, load_mount
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.feasibility_table import Grid
 from dora.geometry.rotations import quaternion_from_rotation_vector
 from dora.robot import RobotDescription
+from dora.robot.shapes import Shape
 from dora.sim.actors import build_box
 from dora.sim.cameras import CameraSpec
 from dora.sim.hinged import HingedObject, drawn_mount
@@ -122,6 +123,7 @@ class MicrowaveTask(Task):
             return build_box(scene.scene, obj, scale, BLUE, sapien.Pose([*self.config.centre, obj.support]))
         self.oven = HingedObject(scene.scene, obj, oven_mount())
         bar = next(p.shape for p in obj.pieces if p.label == obj.target)
+        assert isinstance(bar, Shape)
         self._bar = torch.tensor(np.asarray(bar.segment), dtype=torch.float32, device=scene.device)
         self._bar_radius = float(bar.size[0])
         return self.oven.link
@@ -150,9 +152,9 @@ class MicrowaveTask(Task):
         def reachable(p: Tensor, q: Tensor) -> Tensor:
             return self.startable(right, p, q) & way.repeat_interleave(len(p) // len(way), 0)
 
-        actor = scene.objects["cube"]
-        assert isinstance(actor, Actor)
-        actor.set_pose(Pose.create_from_pq(*standing(cube, scene.halves["cube"][rows, 2], grid, reachable)))
+        scene.objects["cube"].set_pose(
+            Pose.create_from_pq(*standing(cube, scene.halves["cube"][rows, 2], grid, reachable))
+        )
 
     def reachable(
         self, arm: Arm, rows: Int[Tensor, " b"], object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]
@@ -169,7 +171,10 @@ class MicrowaveTask(Task):
         key = arm.name, id(candidates)
         if key not in self._reach:
             mount, r, place = oven_mount(), c.randomisation, c.placing
-            hinge, handle = ((torch.tensor(x.position), torch.tensor(x.quaternion)) for x in mount.links[1:])
+            hinge, handle = (
+                (torch.tensor(link.position), torch.tensor(link.quaternion))
+                for link in (mount.hinge_link, mount.object_link)
+            )
             height = CAVITY[2][0] + float(load_object("cube").mesh.extents[2]) / 2 + place.raised
             if arm.name == LEFT:
                 way = opening_way(hinge, handle, c.opening.standoff, c.opening.target)
@@ -202,7 +207,7 @@ class MicrowaveTask(Task):
 
 
 @cache
-def oven_mount() -> Any:
+def oven_mount() -> Mount:
     """What the handle is mounted on."""
     return load_mount(load_object("microwave"))
 
