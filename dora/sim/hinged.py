@@ -87,7 +87,8 @@ class HingedObject:
     ) -> None:
         """Shuts the environments `rows`, with their mounts at these poses [m], wxyz, and this resistance."""
         zero = torch.zeros(len(rows), 1, device=self._device)
-        self.articulation.set_pose(Pose.create_from_pq(position, quaternion))
+        whole: Any = Pose.create_from_pq(position, quaternion)
+        self.articulation.set_pose(whole)
         self.articulation.set_qpos(zero)
         self.articulation.set_qvel(zero)
         self.set_state({"damping": damping, "friction": friction, "latch": latch}, rows)
@@ -132,9 +133,9 @@ def _build(scene: ManiSkillScene, obj: AffordanceObject, mount: Mount) -> Articu
     parts = []
     for i in range(scene.num_envs):
         builder = scene.create_articulation_builder()
-        made: dict[str, Any] = {}
+        made: dict[str, Any] = {"": None}
         for link in mount.links:
-            made[link.name] = one = builder.create_link_builder(made.get(link.parent))
+            made[link.name] = one = builder.create_link_builder(made[link.parent])
             one.set_name(link.name)
             _join(one, link)
             shapes = _object_shapes(obj) if link.object else [s.primitive for s in link.shapes]

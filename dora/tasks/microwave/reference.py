@@ -175,7 +175,7 @@ def placing(c: PlaceSettings, floor: float) -> list[Waypoint]:
         Waypoint("reach", partial(before, back=c.standoff), c.speed),
         Waypoint("descend", partial(before, back=0.0), c.descent, arrived=(0.008, 0.08)),
         Waypoint("close", grasped, c.descent, closed=1.0, keep=True, patience=0.2),
-        Waypoint("raise", up, 0.25, closed=1.0, arrived=(0.05, 0.3)),
+        Waypoint("raise", up, 0.25, closed=1.0, arrived=(0.05, 0.3), lost=lost),
         Waypoint(
             "carry",
             partial(carried_to, x=-c.front, height=c.raised),

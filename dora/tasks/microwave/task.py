@@ -77,7 +77,7 @@ class MicrowaveTask(Task):
         RIGHT: ArmSpec("cube", "above", (0.0, -0.35, 0.0)),
     }
     DRAWS = STANDING_DRAWS + OVEN_DRAWS
-    MAX_STEPS = 260
+    MAX_STEPS = 320
     ONE_SIZE: ClassVar[frozenset[str]] = frozenset({"microwave"})
     TABLE: ClassVar[TableTop] = TableTop((0.45, 0.0), (0.80, 0.75, 0.02))
     CAMERA = ((-0.55, -1.05, 1.15), (0.52, -0.02, 0.20))
