@@ -12,7 +12,8 @@ LEVELS = {
     "affordance.objects": 4, "affordance.hand": 5, "affordance.maps": 6, "affordance": 7, "affordance.search": 8,
     "affordance.reach": 8, "affordance.views": 9,
     "sim.batch": 10, "sim": 11, "sim.grasp_tests": 12,
-    "tasks.mdp": 13, "tasks.guidance": 14, "tasks.env": 15, "tasks.hammer": 16, "tasks": 17,
+    "tasks.mdp": 13, "tasks.guidance": 14, "tasks.env": 15, "tasks.hammer": 16, "tasks.microwave": 16,
+    "tasks": 17,
     "registration": 18, "tools": 18, "live": 18, "policies": 18.5, "integrations": 18.5, "datasets": 18.7,
     "commands": 19, "__main__": 20,
 }  # fmt: skip
