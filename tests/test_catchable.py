@@ -57,7 +57,6 @@ def test_the_hand_waits_open_and_spread_as_the_grasp_is():
 
 def test_only_grasps_that_face_the_waiting_hand_can_be_used():
     assert usable_in_task("cube") is None
-    assert usable_in_task("microwave") is None
     usable, best = usable_in_task("hammer"), load_candidates("hammer").select([0])
     assert usable is not None
     half = quaternion_from_rotation_vector(torch.tensor([[0.0, 0.0, torch.pi]]))

@@ -62,7 +62,7 @@ def script() -> ModuleType:
         ("--rank-in-task --mesh a.stl", "need --object"),
         ("--make-bundle --object cube --kinematics pytorch_kinematics", "is for searches, not for --make-bundle"),
         ("--rank-in-task --object spoon", "no object 'spoon'"),
-        ("--rank-in-task --object microwave", "no task uses the object 'microwave'"),
+        ("--rank-in-task --any-region --object microwave", "DoraMicrowave-v1 has several arms"),
     ],
 )
 def test_bad_input(

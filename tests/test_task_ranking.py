@@ -1,6 +1,7 @@
 """Ranking candidates by executing them in their task, and what of it comes with Dora."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ import torch
 from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.candidates import concatenate
 from dora.affordance.objects.catalogue import load_object, own_objects
+from dora.affordance.objects.folder_writing import write_object_folder
 from dora.affordance.reach.feasibility_table import file_name
 from dora.errors import InputError
 from dora.tasks import make_task
@@ -77,11 +79,20 @@ def test_the_table_of_reachable_candidates_comes_along(env_id: str):
 
 def test_tasks_say_which_object_they_use():
     found = {name: tasks_of(load_object(name)) for name in ("cube", "hammer", "jug", "microwave")}
-    assert found == {"cube": ["DoraCube-v1"], "hammer": ["DoraHammer-v1"], "jug": ["DoraJug-v1"], "microwave": []}
+    assert found == {
+        "cube": ["DoraCube-v1", "DoraMicrowave-v1"], "hammer": ["DoraHammer-v1"], "jug": ["DoraJug-v1"],
+        "microwave": ["DoraMicrowave-v1"],
+    }  # fmt: skip
     assert tasks_of(replace(load_object("jug"), mass=1.0)) == []  # another jug than the task's
-    assert [name for name in found if usable_in_task(name) is not None] == ["hammer"]
+    assert [name for name in found if usable_in_task(name) is not None] == ["hammer", "microwave"]
 
 
-def test_ranking_needs_a_task():
-    with pytest.raises(InputError, match="no task uses the object 'microwave'"):
-        rank_bundled_set("microwave", lambda title: pytest.fail(title))
+def test_ranking_needs_a_task(tmp_path: Path):
+    folder = write_object_folder(load_object("cube"), tmp_path / "block").parent
+    with pytest.raises(InputError, match=f"no task uses the object '{folder}'"):
+        rank_bundled_set(folder, lambda title: pytest.fail(title))
+
+
+def test_grasps_of_two_arms_are_ranked_by_success_alone():
+    with pytest.raises(InputError, match="DoraMicrowave-v1 has several arms"):
+        rank_bundled_set("microwave", lambda title: pytest.fail(title), region=False)

@@ -212,7 +212,8 @@ def remake(args: Args) -> None:
             usable, settings = usable_in_task(name), Settings(seat=args.seat)
             print(make_bundle(name, args.seed, phases, usable, not args.any_region, settings))
         if args.rank_in_task or ids:
-            print(rank_bundled_set(name, lambda title: phases.phase(title, "episodes"), not args.any_region))
+            paths = rank_bundled_set(name, lambda title: phases.phase(title, "episodes"), not args.any_region)
+            print("\n".join(map(str, paths)))
 
 
 def main() -> int:

@@ -194,7 +194,7 @@ def usable_in_task(name: str | Path) -> Callable[[GraspCandidates], Bool[Tensor,
     """
     obj = load_object(name)
     ids = tasks_of(obj)
-    return None if not ids or obj.on_table else _Usable(ids[0])
+    return None if not ids or obj.on_table else _Usable(ids[0], obj.name)
 
 
 class _Usable:
@@ -203,27 +203,33 @@ class _Usable:
     The starts are drawn once, when it is first called; candidates are in the frame of the task's object [m].
     """
 
-    def __init__(self, env_id: str):
+    def __init__(self, env_id: str, obj: str):
         self._env_id = env_id
+        self._arm = next(arm for arm, spec in find_task(env_id).ARMS.items() if spec.object == obj)
         self._task: DoraEnv | None = None
 
     def __call__(self, candidates: GraspCandidates) -> Bool[Tensor, " c"]:
         if self._task is None:
-            self._task = make_task(self._env_id, STARTS, grasps=candidates)
+            self._task = make_task(self._env_id, STARTS, grasps={self._arm: candidates})
             self._task.reset(seed=SEED)
-        task = self._task
-        task.guide.choice.candidates = candidates.to(task.device)
-        pose = task.target_object.pose
-        return (task.task.reachable(task.arm, torch.arange(STARTS), pose.p, pose.q).float().mean(0) >= USABLE).cpu()
+        task, arm = self._task, self._task.arms[self._arm]
+        adapted = task.task.adapted(candidates, self._arm, arm.agent.description)
+        arm.guide.choice.candidates = adapted.to(task.device)
+        pose = task.objects[arm.spec.object].pose
+        able = task.task.reachable(arm, torch.arange(STARTS), pose.p, pose.q)
+        return (able.float().mean(0) >= USABLE).cpu()
 
 
-def rank_bundled_set(name: str | Path, phase: Callable[[str], Callable[[int, int], None]], region: bool = True) -> Path:
+def rank_bundled_set(
+    name: str | Path, phase: Callable[[str], Callable[[int, int], None]], region: bool = True
+) -> list[Path]:
     """Executes the bundled grasps of an object in its task and stores them anew, best first, with the number of steps
     that this took. Those of the search for the target region are ranked if they have its class.
 
     All are tried a few times, and the better ones again with other starts: their scores are those of the second round,
     and those of the others at most as high. Grasps of other classes follow as they were. The tables of f_reach in the
-    object's folder are made to match.
+    object's folder are made to match. In a task of several arms, the grasps of all of them are ranked together, in the
+    same episodes; those of an object that another task ranks for itself go into a file of their own.
 
     Args:
         name: of an object or its folder, as for `load_object`.
@@ -231,30 +237,50 @@ def rank_bundled_set(name: str | Path, phase: Callable[[str], Callable[[int, int
         region: the set of the search for the target region, ranked by success; otherwise the set of the search that
             knows no region, of all classes, ranked by whether the object is held.
 
+    Returns:
+        The files that were written.
+
     Raises:
-        InputError: no such object, no candidates, or no task that uses the object.
+        InputError: no such object, no candidates, no task that uses the object, or one of several arms, where only
+            success is known, without `region`.
     """
     obj = load_object(name)
     ids = tasks_of(obj)
     if not ids:
         raise InputError(f"no task uses the object {str(name)!r}, so its grasps cannot be ranked in one.")
-    found = load_candidates(name, region=region)
-    wanted = found.of_class(obj.target_class) if region else torch.ones(len(found), dtype=torch.bool)
-    tested = found.select(wanted)
-    count, everything, better = len(tested), phase(f"{obj.name}: execute all"), f"{obj.name}: execute the better ones"
-    first = rank_in_task(ids[0], tested, FIRST_TRIES * count, progress=everything, region=region)
-    tested = ranked(tested, first)
-    few = math.ceil(BETTER * count)
-    best, rest = tested.select(slice(few)), tested.select(slice(few, None))
-    again = rank_in_task(ids[0], best, MORE_TRIES * few, progress=phase(better), seed=2 * SEED, region=region)
-    best = ranked(best, again)
-    tested = concatenate([best, replace(rest, score=rest.score.clamp(max=float(best.score.min())))])
-    others = [found.select(~wanted)] if not wanted.all() else []
-    path = bundled_path(name, region)
-    settings = _as_mapping(found.settings) | {"ranking_steps": first.steps + again.steps}
-    replace(concatenate([tested, *others]), settings=json.dumps(settings)).save(path)
-    bundle_feasibility_tables(name)
-    return path
+    arms = find_task(ids[0]).ARMS
+    if len(arms) > 1 and not region:
+        raise InputError(f"{ids[0]} has several arms, where grasps are ranked by success alone: leave any-region out.")
+    objects = {arm: obj if spec.object == obj.name else load_object(spec.object) for arm, spec in arms.items()}
+    found = {arm: load_candidates(name if o is obj else o.name, region=region) for arm, o in objects.items()}
+    wanted = {
+        arm: f.of_class(objects[arm].target_class) if region else torch.ones(len(f), dtype=torch.bool)
+        for arm, f in found.items()
+    }
+    tested = {arm: found[arm].select(mask) for arm, mask in wanted.items()}
+    everything, better = phase(f"{obj.name}: execute all"), f"{obj.name}: execute the better ones"
+    first = rank_arms(ids[0], tested, FIRST_TRIES * _most(tested), progress=everything, region=region)
+    tested = {arm: ranked(t, first[arm]) for arm, t in tested.items()}
+    best = {arm: t.select(slice(math.ceil(BETTER * len(t)))) for arm, t in tested.items()}
+    again = rank_arms(ids[0], best, MORE_TRIES * _most(best), progress=phase(better), seed=2 * SEED, region=region)
+    written = []
+    for arm, one in objects.items():
+        top = ranked(best[arm], again[arm])
+        rest = tested[arm].select(slice(len(top), None)) if len(top) < len(tested[arm]) else None
+        low = float(top.score.min())
+        parts = [top] + ([replace(rest, score=rest.score.clamp(max=low))] if rest is not None else [])
+        others = [found[arm].select(~wanted[arm])] if not wanted[arm].all() else []
+        settings = _as_mapping(found[arm].settings) | {"ranking_steps": first[arm].steps + again[arm].steps}
+        own = None if tasks_of(one)[:1] in ([], [ids[0]]) else ids[0]
+        written.append(bundled_path(name if one is obj else one.name, region, own))
+        replace(concatenate([*parts, *others]), settings=json.dumps(settings)).save(written[-1])
+        bundle_feasibility_tables(name if one is obj else one.name)
+    return written
+
+
+def _most(sets: Mapping[str, GraspCandidates]) -> int:
+    """Number of candidates of the largest set."""
+    return max(map(len, sets.values()))
 
 
 def _as_mapping(settings: str) -> dict[str, Any]:
@@ -272,15 +298,20 @@ def bundle_feasibility_tables(name: str | Path) -> list[Path]:
     Raises:
         InputError: no such object, or it has no folder.
     """
-    folder, kept = bundled_path(name).parent, []
+    obj, folder, kept = load_object(name), bundled_path(name).parent, list[Path]()
     sets = ["affordance"] + ["grasps"] * bundled_path(name, region=False).is_file()
-    for env_id, guidance in itertools.product(tasks_of(load_object(name)), sets):
-        task = make_task(env_id, 1, guidance)
-        table = task.arm.reach_table
+    for env_id, guidance in itertools.product(tasks_of(obj), sets):
+        try:
+            task = make_task(env_id, 1, guidance)
+        except InputError:
+            if guidance == "affordance":
+                raise
+            continue  # another object of this task has no grasps of a search that knows no region
+        for arm in task.arms.values():
+            if arm.spec.object == obj.name and (table := arm.reach_table) is not None:
+                kept.append(folder / file_name(table.digest))
+                table.save(kept[-1])
         task.close()
-        if table is not None:
-            kept.append(folder / file_name(table.digest))
-            table.save(kept[-1])
     for old in set(folder.glob(file_name("*"))) - set(kept):
         old.unlink()
     return kept
