@@ -20,21 +20,9 @@ from dora.affordance.reach.approach_paths import (
 from dora.affordance.reach.feasibility import Reach
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_apply, quaternion_multiply
-from dora.robot import load_robot
 from dora.robot.motion.collision import CollisionModel
 from dora.robot.motion.height_bounds import ArmHeightBounds, HandHeightBounds
-from dora.robot.motion.inverse_kinematics import InverseKinematics
 from dora.robot.motion.planning import densified
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("diana7_hit")
-
-
-@pytest.fixture(scope="module")
-def kinematics(robot):
-    return InverseKinematics(robot)
 
 
 def test_heights_are_where_coal_touches_the_table(robot, kinematics):

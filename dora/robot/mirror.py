@@ -20,7 +20,7 @@ import numpy as np
 import tomli_w
 import trimesh
 
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.files import make_folder, write_bytes
 from dora.reading import read_toml
 from dora.robot.build import urdf_number
@@ -161,17 +161,14 @@ def write_mirrored(source: Path, target: Path) -> list[Path]:
     return list(written)
 
 
+@command
 def main() -> None:
     """Write the image of the first folder that is named on the command line into the second one."""
     if len(sys.argv) != 3:
         raise SystemExit("usage: python -m dora.robot.mirror FOLDER FOLDER_OF_THE_IMAGE")
-    try:
-        for path in write_mirrored(Path(sys.argv[1]), Path(sys.argv[2])):
-            print(path, path.stat().st_size)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(2) from error
+    for path in write_mirrored(Path(sys.argv[1]), Path(sys.argv[2])):
+        print(path, path.stat().st_size)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
