@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from dora import quiet_start
+from dora.errors import BAD_INPUT
 from dora.version import version_line
 
 COMMANDS = {
@@ -24,8 +25,6 @@ COMMANDS = {
 """What `dora NAME` does; the body of each is the module `dora.commands.NAME`."""
 SHELLS = ("bash", "zsh", "fish")
 """Shells for which --completion prints a script."""
-BAD_INPUT = 2
-"""Exit status after input that a person can mend."""
 
 
 def usage() -> str:

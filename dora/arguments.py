@@ -44,6 +44,11 @@ def as_tensor(value: Any, what: str, device: torch.device | str | None = None) -
     return _single(value) if value.dtype == torch.float64 else value
 
 
+def as_array(value: Any) -> np.ndarray:
+    """A tensor on any device, or what numpy takes, as an array of its own memory."""
+    return value.numpy(force=True).copy() if isinstance(value, Tensor) else np.array(value)
+
+
 def _single(value: Tensor) -> Tensor:
     """Doubles as float32; finite ones that are too large become the largest one, not infinity."""
     most = torch.finfo(torch.float32).max

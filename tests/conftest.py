@@ -26,6 +26,22 @@ def project_root(pytestconfig: pytest.Config):
     return pytestconfig.rootpath
 
 
+@pytest.fixture(scope="session")
+def robot():
+    """The robot that comes with Dora; modules of ours are imported in fixtures only, when their types are checked."""
+    from dora.robot import load_robot
+
+    return load_robot("diana7_hit")
+
+
+@pytest.fixture(scope="session")
+def kinematics(robot):
+    """Its inverse kinematics."""
+    from dora.robot.motion.inverse_kinematics import InverseKinematics
+
+    return InverseKinematics(robot)
+
+
 @pytest.fixture
 def materials() -> None:
     """Tasks of ManiSkill on its own back end make materials, which need stand-ins where there is no Vulkan driver. A

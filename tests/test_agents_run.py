@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from commands import call, load_command
+from commands import call, load_command, refusal
 from fake_task import PointMass
 
 import dora.agents
@@ -68,11 +68,7 @@ def test_bad_input(
     arguments: str,
     words: str,
 ):
-    assert call(script, monkeypatch, *arguments.split()) == 2
-    captured = capsys.readouterr()
-    assert words in captured.err
-    assert captured.err.count("\n") == 1
-    assert captured.out == ""
+    assert words in refusal(script, monkeypatch, capsys, arguments)
 
 
 @pytest.mark.parametrize("arguments", ["--env DoraCube-v1 --seed x", "--env DoraCube-v1 --no-such-option 1"])

@@ -9,16 +9,11 @@ import torch
 from dora.affordance.candidates import GraspCandidates, concatenate, hand_digest
 from dora.affordance.objects.catalogue import AffordanceObject, load_object
 from dora.errors import InputError
-from dora.robot import RobotDescription, load_robot
+from dora.robot import RobotDescription
 
 COUNT = 6
 CONTACTS = 4
 POINTS = 50
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotDescription:
-    return load_robot("diana7_hit")
 
 
 @pytest.fixture(scope="module")

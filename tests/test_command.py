@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from dora import __main__ as command
+from dora import errors
 from dora.version import source_commit, version_line
 
 HELP_SECONDS = 0.5
@@ -128,3 +129,23 @@ def test_bash_completes_a_command_and_an_option(capsys: pytest.CaptureFixture[st
 def test_completion_of_an_unknown_shell_is_refused(capsys: pytest.CaptureFixture[str]):
     assert command.main(["--completion", "tsch"]) == command.BAD_INPUT
     assert "bash, zsh, fish" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("returned", "status"), [(None, 0), (0, 0), (3, 3)])
+def test_what_a_command_returns_is_its_status(returned: int | None, status: int):
+    assert errors.command(lambda: returned)() == status
+
+
+def test_a_command_says_in_one_line_what_is_wrong_with_its_input(capsys: pytest.CaptureFixture[str]):
+    @errors.command
+    def refuse(name: str) -> None:
+        raise errors.InputError(f"no object {name!r}")
+
+    assert refuse("spoon") == errors.BAD_INPUT == 2
+    assert capsys.readouterr() == ("", "no object 'spoon'\n")
+    with pytest.raises(ValueError, match="a mistake of ours"):
+        errors.command(_mistake)()
+
+
+def _mistake() -> None:
+    raise ValueError("a mistake of ours")

@@ -20,6 +20,7 @@ from commands import call, load_command
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 
+from dora.configs import plain
 from dora.datasets.episodes import Episode, Plan, make_batch, roll_out
 from dora.datasets.facts import Facts, facts_of
 from dora.datasets.lerobot import write_lerobot
@@ -28,6 +29,7 @@ from dora.datasets.record import FORMATS, record_dataset
 from dora.datasets.sources import find_source
 from dora.errors import InputError
 from dora.sim import can_render
+from dora.tasks.mdp.randomisation import PRESETS
 
 ENV = "DoraCube-v1"
 SIZES = {"observation": 7, "action": 3}
@@ -90,11 +92,8 @@ def test_lerobot_tables_hold_the_episodes(tmp_path: Path):
     assert set(frames) == set(info["features"])
     for k, (episode, row) in enumerate(zip(episodes, rows, strict=True)):
         own = slice(row["dataset_from_index"], row["dataset_to_index"])
-        assert (row["episode_index"], row["length"], row["seed"], row["success"]) == (
-            k,
-            *EPISODES[k][1::-1],
-            episode.success,
-        )
+        own_row = (row["episode_index"], row["length"], row["seed"], row["success"])
+        assert own_row == (k, *EPISODES[k][1::-1], episode.success)
         np.testing.assert_array_equal(frames["observation.state"][own], episode.observations[:-1])
         np.testing.assert_array_equal(frames["action"][own], episode.actions)
         np.testing.assert_array_equal(frames["next.reward"][own], episode.rewards)
@@ -257,9 +256,8 @@ class Timed(gym.Wrapper):
 
 
 def test_an_episode_ends_where_the_environment_says_so(batch: Any):
-    found = [
-        e for _, e in roll_out(Timed(batch), lambda env, obs: torch.full((2, 1), 3.0), Plan(3, seed=4, num_envs=2))
-    ]
+    plan = Plan(3, seed=4, num_envs=2)
+    found = [e for _, e in roll_out(Timed(batch), lambda env, obs: torch.full((2, 1), 3.0), plan)]
     assert [(e.seed, len(e), e.success) for e in found] == [(4, 2, True), (5, 3, False), (6, 2, True)]
     np.testing.assert_allclose(found[1].observations[:, 0], [5.0, 5.1, 5.2, 5.3], rtol=1e-6)
     assert found[1].truncated.tolist() == [False, False, True]
@@ -282,7 +280,7 @@ def test_without_successes_it_gives_up(batch: Any, monkeypatch: pytest.MonkeyPat
 def test_a_policy_acts_in_its_own_task_with_another_preset():
     source = find_source(ENV, "policy", "hard")
     assert source.options["preset"] == "hard"
-    assert source.options["config"]["randomisation"]["delay"] if "config" in source.options else True
+    assert source.options["config"]["randomisation"] == plain(PRESETS["hard"])
     obs = torch.zeros(2, 211)
     assert source.act(None, obs).shape == (2, 26)  # pyright: ignore[reportArgumentType]
 

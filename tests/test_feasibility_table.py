@@ -12,16 +12,10 @@ from dora.affordance.reach.feasibility import Reach
 from dora.affordance.reach.feasibility_table import Grid, ReachTable, table_digest
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_multiply
-from dora.robot import load_robot
 from dora.robot.motion import controller_rollout, inverse_kinematics
 from dora.sim import controllers
 from dora.tasks.guidance.grasp_and_lift import GraspSettings
 from dora.tasks.mdp.config import TaskConfig
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("diana7_hit")
 
 
 @pytest.fixture(scope="module")

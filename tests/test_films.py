@@ -53,7 +53,9 @@ def test_a_picture_of_any_shape_becomes_a_square_of_its_middle():
 
 def test_without_a_driver_films_end_in_one_sentence(tmp_path):
     out = tmp_path / "films"
-    program = f"import sys; sys.argv[1:] = ['--out', {str(out)!r}]; from dora.policies.films import main; main()"
+    program = (
+        f"import sys; from dora.policies.films import main; sys.argv[1:] = ['--out', {str(out)!r}]; sys.exit(main())"
+    )
     result = run_without_driver(program)
     assert result.returncode == 2
     assert "No film: SAPIEN finds no Vulkan driver here" in result.stderr

@@ -10,7 +10,7 @@ import mani_skill
 import numpy as np
 import pytest
 import torch
-from commands import call, load_command
+from commands import call, load_command, refusal
 
 from dora.affordance.bundled_sets import bundled_path
 from dora.affordance.candidates import GraspCandidates
@@ -72,11 +72,7 @@ def test_bad_input(
     arguments: str,
     words: str,
 ):
-    assert call(script, monkeypatch, *arguments.split()) == 2
-    captured = capsys.readouterr()
-    assert words in captured.err
-    assert captured.err.count("\n") == 1
-    assert captured.out == ""
+    assert words in refusal(script, monkeypatch, capsys, arguments)
 
 
 @pytest.mark.parametrize("arguments", ["--validate isaac", "--kinematics newton", "--ship", "--no-such-option 1"])

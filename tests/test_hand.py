@@ -8,15 +8,10 @@ import torch
 from dora.affordance.hand.capsules import Capsule, capsules_of, farthest_points
 from dora.affordance.hand.hand_model import PALM, HandModel
 from dora.geometry.rotations import matrix_from_rotation_vector
-from dora.robot import RobotDescription, Shape, load_robot
+from dora.robot import Shape
 
 POSITION_TOLERANCE = 1e-5
 """Largest accepted difference of two libraries' frames (m, and unitless for rotation entries)."""
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotDescription:
-    return load_robot("diana7_hit")
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,7 @@
-"""Batches as environments of other libraries: TorchRL and Stable-Baselines3."""
+"""Batches as environments of other libraries: gymnasium, TorchRL and Stable-Baselines3."""
 
+import copy
+import pickle
 import subprocess
 import sys
 from typing import Any
@@ -8,6 +10,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from mani_skill.utils.registration import TimeLimitWrapper
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
@@ -79,6 +83,72 @@ print([bool(single.step(None)[3]) for _ in range(2)], bool((first[0] == obs[0]).
         "ManiSkillVectorEnv (3, 211) [3, 7]",
         "[False, True] True",
     ]
+
+
+HEADLESS: dict[str, Any] = {"render_backend": "none", "obs_mode": "state"}
+COPIES = {
+    "itself": lambda spec: spec,
+    "deep copy": copy.deepcopy,
+    "pickled": lambda spec: pickle.loads(pickle.dumps(spec)),
+    "deep copy, pickled and copied again": lambda spec: copy.deepcopy(pickle.loads(pickle.dumps(copy.deepcopy(spec)))),
+}
+"""Ways to come by what is registered under an id."""
+
+
+def _ends(env: Any, steps: int) -> list[list[bool]]:
+    """Which environments are out of time after each step; a limit of gymnasium's, no tensor, has no `tolist`."""
+    env.reset(seed=0)
+    ends = [env.step(None)[3].tolist() for _ in range(steps)]
+    env.close()
+    return ends
+
+
+@pytest.mark.parametrize("way", COPIES)
+def test_what_is_registered_keeps_its_time_limit_when_it_is_copied(way: str):
+    copied = COPIES[way](gym.spec("DoraCube-v1"))
+    env: Any = gym.make(copied, num_envs=2, max_episode_steps=2, **HEADLESS)
+    assert type(env) is TimeLimitWrapper
+    assert _ends(env, 2) == [[False] * 2, [True] * 2]
+    env = gym.make(copied, num_envs=1, **HEADLESS)
+    assert env._max_episode_steps == copied.max_episode_steps == env.unwrapped.max_steps
+    env.close()
+
+
+def test_an_episode_of_a_copied_id_is_as_long_as_its_task():
+    env: Any = gym.make(copy.deepcopy(gym.spec("DoraCube-v1")), num_envs=1, **HEADLESS)
+    limit = env.unwrapped.max_steps
+    assert _ends(env, limit) == [[False]] * (limit - 1) + [[True]]
+
+
+def test_a_registered_id_has_no_json_as_those_of_maniskill_have_none():
+    for env_id in IDS:
+        with pytest.raises(ValueError, match="Callable found"):
+            gym.spec(env_id).to_json()
+
+
+@pytest.mark.parametrize(
+    ("mode", "way"),
+    [(None, "deep copy, pickled and copied again"), ("vector_entry_point", "itself"), ("sync", "itself")],
+)
+def test_gymnasium_makes_a_vector_environment_of_what_was_copied(mode: str | None, way: str):
+    _check_vector(COPIES[way](gym.spec("DoraCube-v1")), mode)
+    assert gym.spec("DoraCube-v1").additional_wrappers, "make_vec took the wrapper of what is registered"
+
+
+@pytest.mark.slow
+def test_processes_of_gymnasium_work_when_they_are_spawned():
+    """Forked ones stand still at the first operation of torch that runs in threads."""
+    _check_vector("DoraCube-v1", "async", vector_kwargs={"context": "spawn"})
+
+
+def _check_vector(env_id: Any, mode: str | None, **kwargs: Any) -> None:
+    env = gym.make_vec(env_id, 2, mode, max_episode_steps=2, **HEADLESS, **kwargs)
+    kinds = {"sync": gym.vector.SyncVectorEnv, "async": gym.vector.AsyncVectorEnv}
+    assert type(env) is kinds.get(mode or "", ManiSkillVectorEnv)
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape or (), np.float32)
+    assert [np.ravel(env.step(action)[3]).tolist() for _ in range(2)] == [[False] * 2, [True] * 2]
+    env.close()
 
 
 @pytest.fixture

@@ -7,18 +7,8 @@ from placements import yaws
 
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_matrix, rotation_angle
-from dora.robot import SerialChain, load_robot
+from dora.robot import SerialChain
 from dora.robot.motion.inverse_kinematics import ANGLE_TOLERANCE, POSITION_TOLERANCE, InverseKinematics
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("diana7_hit")
-
-
-@pytest.fixture(scope="module")
-def kinematics(robot):
-    return InverseKinematics(robot)
 
 
 def reachable_poses(kinematics, count):

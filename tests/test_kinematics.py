@@ -16,7 +16,7 @@ import torch
 
 from dora.errors import InputError
 from dora.geometry import rotations as rot
-from dora.robot import RobotDescription, SerialChain, load_robot
+from dora.robot import RobotDescription, SerialChain
 
 CONFIGURATIONS = 24
 POSITION_TOLERANCE = 1e-5
@@ -32,11 +32,6 @@ DIANA_DH = (
     (-math.pi / 2, 0.087, -0.1169, 0.0),
 )
 """Modified DH rows of the arm: alpha (rad), a (m), d (m), offset of theta (rad)."""
-
-
-@pytest.fixture(scope="module")
-def robot() -> RobotDescription:
-    return load_robot("diana7_hit")
 
 
 @pytest.fixture(scope="module")

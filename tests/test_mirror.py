@@ -1,5 +1,6 @@
 """The mirror image of a robot: what is committed is what the command writes, and it is the image of the original."""
 
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -115,6 +116,8 @@ def test_the_image_of_the_image_is_the_original(right: RobotDescription, tmp_pat
     ("change", "words"),
     [
         (("meshes/palm.glb", "../palm.glb"), "lies outside the folder"),
+        (("meshes/palm.glb", "/palm.glb"), "lies outside the folder"),
+        (("meshes/palm.glb", "package://palm.glb"), "lies outside the folder"),
         (('xyz="0 0 0.0752"', 'xyz="0 0"'), "<origin> that cannot be read"),
         (("</robot>", ""), "no XML"),
     ],
@@ -122,6 +125,47 @@ def test_the_image_of_the_image_is_the_original(right: RobotDescription, tmp_pat
 def test_what_cannot_be_mirrored_is_refused(change: tuple[str, str], words: str, right: RobotDescription):
     with pytest.raises(InputError, match=words):
         mirrored_urdf(right.urdf.read_text().replace(*change), "image", right.name)
+
+
+@pytest.fixture
+def copied(right: RobotDescription, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(right.folder, tmp_path / "copied"))
+
+
+def test_meshes_are_those_that_the_urdf_names(copied: Path, tmp_path: Path):
+    (copied / "visual").mkdir()
+    (copied / "meshes/palm.glb").rename(copied / "visual/right_palm.glb")
+    _replace(copied / "robot.urdf", "meshes/palm.glb", "visual/right_palm.glb")
+    written = {path.relative_to(tmp_path / "image") for path in write_mirrored(copied, tmp_path / "image")}
+    assert Path("visual/left_palm.glb") in written
+    assert 'filename="visual/left_palm.glb"' in (tmp_path / "image/robot.urdf").read_text()
+
+
+@pytest.mark.parametrize(
+    ("named", "content", "words"),
+    [
+        ("meshes/other.glb", None, "other.glb is missing"),
+        ("meshes/palm.stl", b"solid palm", "palm.stl is no .glb file"),
+        ("meshes/palm.glb", b"spoiled", "palm.glb is no intact glTF"),
+    ],
+)
+def test_without_a_mesh_nothing_is_written(copied: Path, named: str, content: bytes | None, words: str):
+    _replace(copied / "robot.urdf", "meshes/palm.glb", named)
+    if content is not None:
+        (copied / named).write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        write_mirrored(copied, copied.parent / "image")
+    assert not (copied.parent / "image").exists()
+
+
+def _replace(path: Path, old: str, new: str) -> None:
+    path.write_text(path.read_text().replace(old, new))
+
+
+def test_a_robot_can_be_named_by_its_name(right: RobotDescription, tmp_path: Path):
+    assert tmp_path / "image/robot.toml" in write_mirrored(Path(right.name), tmp_path / "image")
+    with pytest.raises(InputError, match="is the robot itself"):
+        write_mirrored(Path(right.name), right.folder)
 
 
 def test_a_robot_is_not_overwritten_by_its_image(right: RobotDescription):

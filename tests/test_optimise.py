@@ -23,15 +23,9 @@ from dora.affordance.search.optimise import opened, optimise, table_of
 from dora.affordance.search.quasi_static_closing import close_hand
 from dora.affordance.search.search import Search, Settings
 from dora.errors import InputError
-from dora.robot import load_robot
 
 COUNT = 12
 SHORT = Settings(iterations=60, starts=3)
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("diana7_hit")
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from dora.errors import InputError
-from dora.robot import Shape, load_robot
+from dora.robot import Shape
 from dora.robot.motion import collision
 from dora.robot.motion.collision import KINDS, CollisionModel
 from dora.robot.motion.planning import EDGE_LIMIT, PlanSettings, densified, plan, timed
@@ -19,11 +19,6 @@ RAMP = 0.3
 """Time from rest to full speed [s]."""
 CHECK_SPACING = 0.002
 """Distance of postures at which a plan is checked [rad]; finer than what the planner looks at."""
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("diana7_hit")
 
 
 @pytest.fixture(scope="module")

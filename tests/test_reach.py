@@ -20,21 +20,13 @@ from dora.affordance.reach.approach_paths import (
 from dora.affordance.reach.feasibility import Reach
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_apply, quaternion_multiply
-from dora.robot import load_robot
 from dora.robot.motion.collision import CollisionModel
 from dora.robot.motion.height_bounds import ArmHeightBounds, HandHeightBounds
-from dora.robot.motion.inverse_kinematics import InverseKinematics
+from dora.robot.motion.inverse_kinematics import POSITION_TOLERANCE
 from dora.robot.motion.planning import densified
 
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("diana7_hit")
-
-
-@pytest.fixture(scope="module")
-def kinematics(robot):
-    return InverseKinematics(robot)
+ROUNDING = 1e-5
+"""What float32 adds to an error of a pose [m]."""
 
 
 def test_heights_are_where_coal_touches_the_table(robot, kinematics):
@@ -88,7 +80,7 @@ def test_nothing_is_left_far_away(robot):
     ("name", "motion"), [("jug", "none"), ("jug", "controller"), ("hammer", "controller"), ("hammer", "plan")]
 )
 def test_what_passes_stands_up_to_brute_force(robot, kinematics, name, motion):
-    """Every accepted candidate is reached exactly, and free along a finely sampled approach."""
+    """Every accepted candidate is reached, and free of collisions at the standoff and at the grasp."""
     obj = load_object(name)
     settings = ReachSettings(motion=motion)
     reach, candidates = Reach(robot, obj, settings=settings), clear_grasps(robot, obj, 10)
@@ -96,6 +88,10 @@ def test_what_passes_stands_up_to_brute_force(robot, kinematics, name, motion):
     result = reach.filter(candidates, p, q)
     assert result.reachable.any()
     assert torch.equal(result.reachable, result.reason == OK)
+    # Inverse kinematics is exact; a motion of the controller goes on as soon as it is near enough.
+    controller = settings.controller
+    exact = (POSITION_TOLERANCE, POSITION_TOLERANCE)
+    reached, arrived = (controller.settled[0], controller.arrived[0]) if motion == "controller" else exact
     model = CollisionModel(
         robot, reach.pieces,
         clearance={"arm": -0.001, "table": 0.0, "arm object": 0.0, "hand object": -settings.overlap - 0.001},
@@ -103,10 +99,10 @@ def test_what_passes_stands_up_to_brute_force(robot, kinematics, name, motion):
     for pose, index in result.reachable.nonzero()[:12].tolist():
         goal = p[pose] + quaternion_apply(q[pose], candidates.position[index])
         place, _ = kinematics.chain.tip_pose(result.arm_q[pose, index][None])
-        assert (place[0] - goal).norm() < ReachSettings().controller.settled[0] + 0.0005
+        assert (place[0] - goal).norm() < reached + ROUNDING
         back, _ = kinematics.chain.tip_pose(result.standoff_q[pose, index][None])
         away = goal - quaternion_apply(q[pose], candidates.approach[index]) * settings.standoff
-        assert (back[0] - away).norm() < 0.021
+        assert (back[0] - away).norm() < arrived + ROUNDING
         model.place_object(p[pose].double().numpy(), q[pose].double().numpy())
         ends = torch.stack([result.standoff_q[pose, index], result.arm_q[pose, index]]).double().numpy()
         hand = candidates.pregrasp[index].double().numpy()

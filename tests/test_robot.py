@@ -31,11 +31,6 @@ MAX_MESH_BYTES = 1_500_000
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 
 
-@pytest.fixture(scope="module")
-def robot() -> RobotDescription:
-    return load_robot("diana7_hit")
-
-
 @pytest.fixture
 def folder(robot, tmp_path) -> Path:
     """A copy of the robot's folder that a test may spoil."""

@@ -1,6 +1,7 @@
 """What every registered Dora task must do, whatever it is about."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -126,18 +127,28 @@ def test_state_round_trip_restores_stage_observation_and_future(batch: DoraEnv):
     state, info = batch.get_state_dict(), batch.get_info()
     seen = batch.get_obs(info)
     batch.step(batch.scripted_action())
-    after = batch.snapshot
+    after, touching = batch.snapshot, touching_itself(batch)
     batch.reset(seed=9)
     batch.set_state_dict(state)
     assert torch.equal(batch.machine.index, state["machine"]["stage"])
     torch.testing.assert_close(batch.get_obs(batch.get_info()), seen, atol=5e-3, rtol=0.02)
     batch.step(batch.scripted_action())
-    # PhysX forgets contacts, so what touches settles anew after a restoration.
-    now = batch.snapshot
+    # PhysX remembers friction from step to step and no state holds it: fingers that lean on one another slip, by up to
+    # 4.7e-3 rad here. Where none do, joints [rad] are within 1e-7, and objects [m], which lie or fall, within 2e-6.
+    now, free = batch.snapshot, ~(touching | touching_itself(batch))
     for name in after.objects:
-        torch.testing.assert_close(now.objects[name].p, after.objects[name].p, atol=5e-4, rtol=0)
+        torch.testing.assert_close(now.objects[name].p, after.objects[name].p, atol=1e-5, rtol=0)
     for arm in after.hands:
         torch.testing.assert_close(now.hands[arm].q, after.hands[arm].q, atol=6e-3, rtol=0)
+        torch.testing.assert_close(now.hands[arm].q[free], after.hands[arm].q[free], atol=1e-6, rtol=0)
+
+
+def touching_itself(task: DoraEnv) -> Tensor:
+    """Mask (n,) of the environments in which links of robots touch each other."""
+    links = {link.name for arm in task.arms.values() for link in arm.agent.robot.get_links()}
+    systems: list[Any] = [scene.physx_system for scene in task.scene.sub_scenes]
+    found = [[{body.entity.name for body in c.bodies} for c in system.get_contacts()] for system in systems]
+    return torch.tensor([any(pair <= links for pair in pairs) for pairs in found])
 
 
 @pytest.mark.parametrize("which", [[2], [0, 1, 3, 4, 5]])

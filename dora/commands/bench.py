@@ -2,11 +2,10 @@
 
 import dataclasses
 import json
-import sys
 
 import tyro
 
-from dora.errors import InputError
+from dora.errors import command
 from dora.parallel import available_cores
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
@@ -93,11 +92,8 @@ def report(result: dict, as_json: bool) -> None:
         print_table(("what", "value"), [(name, str(value)) for name, value in result.items()])
 
 
+@command
 def main() -> int:
     """Run the command; returns the exit status."""
-    try:
-        app.cli(description=__doc__)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
+    app.cli(description=__doc__)
     return 0

@@ -8,7 +8,6 @@ The folder appears when the dataset is whole, and its path is the last line prin
 """
 
 import logging
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,11 +20,9 @@ from dora.configs import check_ranges
 from dora.datasets.episodes import Plan
 from dora.datasets.record import LAST_SEED, check_possible, record_dataset
 from dora.datasets.sources import find_source
-from dora.errors import InputError
+from dora.errors import command
 from dora.progress import ProgressDisplay
 
-BAD_INPUT = 2
-"""Exit status after input that a person can mend."""
 RANGES = {"episodes": (1, 1_000_000), "seed": (0, LAST_SEED), "num_envs": (1, 1024)}
 """Lowest and highest value of options."""
 
@@ -56,23 +53,20 @@ class Args:
     """Environments that are stepped together."""
 
 
+@command
 def main() -> int:
     """Run the command; returns the exit status."""
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     torch.set_num_threads(1)
     logging.getLogger("mani_skill").setLevel(logging.ERROR)  # what a missing driver means is said in one sentence
-    try:
-        check_ranges(args, RANGES, lambda name: f"--{name.replace('_', '-')}")
-        plan = Plan(args.episodes, args.seed, args.only_successes, args.num_envs)
-        source = find_source(args.env, args.policy, args.preset)
-        check_possible(args.format, plan, args.out, args.pictures)
-        start = time.monotonic()
-        with ProgressDisplay() as progress:
-            update = progress.phase(f"{source.name} in {args.env}", "episodes")
-            made = record_dataset(args.format, source, plan, args.out, args.pictures, update)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return BAD_INPUT
+    check_ranges(args, RANGES, lambda name: f"--{name.replace('_', '-')}")
+    plan = Plan(args.episodes, args.seed, args.only_successes, args.num_envs)
+    source = find_source(args.env, args.policy, args.preset)
+    check_possible(args.format, plan, args.out, args.pictures)
+    start = time.monotonic()
+    with ProgressDisplay() as progress:
+        update = progress.phase(f"{source.name} in {args.env}", "episodes")
+        made = record_dataset(args.format, source, plan, args.out, args.pictures, update)
     seconds = time.monotonic() - start
     print(f"{made.episodes} episodes, {made.successes} of them a success, {made.steps:,} steps, in {seconds:.0f} s")
     print(args.out)

@@ -23,7 +23,7 @@ from dora.affordance.objects.importing import import_mesh, size_in_words
 from dora.affordance.search.backends import Kinematics
 from dora.affordance.search.optimise import Settings
 from dora.configs import check_ranges
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.sim.grasp_tests.bundle_maker import make_bundle
@@ -35,8 +35,6 @@ from dora.tools.task_ranking import rank_bundled_set, tasks_of, usable_in_task
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
-BAD_INPUT = 2
-"""Exit status after an `InputError`."""
 RANGES = {
     "num": (1, 100_000),
     "seed": (0, 2**31 - 1),
@@ -216,6 +214,7 @@ def remake(args: Args) -> None:
             print("\n".join(map(str, paths)))
 
 
+@command
 def main() -> int:
     """Run the command; returns the exit status."""
     description = f"{__doc__}\nObjects: {', '.join(available_objects())}."
@@ -227,9 +226,6 @@ def main() -> int:
             remake(args)
         else:
             run(args)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return BAD_INPUT
     except KeyboardInterrupt:
         print("Interrupted; nothing was written.", file=sys.stderr)
         return INTERRUPTED

@@ -11,7 +11,6 @@ Needs no GPU and no graphics driver; only a film needs a Vulkan driver. Runs unt
 import contextlib
 import functools
 import logging
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ import tyro
 
 from dora.agents.evaluation.play import record
 from dora.configs import check_ranges
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.files import make_folder
 from dora.live.page import Page
 from dora.live.players import Player, recorded, zero_correction
@@ -33,8 +32,6 @@ from dora.policies.policy import bundled_ids, load_policy
 from dora.sim.batch.rendering import can_render
 from dora.tasks import check_task_id, make_task
 
-BAD_INPUT = 2
-"""Exit status after input that a person can mend."""
 RANGES = {"port": (1, 65_535), "seed": (0, LARGEST_SEED), "episodes": (1, 1000)}
 """Lowest and highest value of options."""
 POLICY = "policy"
@@ -153,19 +150,16 @@ def serve(session: Session, port: int, host: str) -> None:
             raise RuntimeError(f"the page has ended: {error}") from error
 
 
+@command
 def main() -> int:
     """Run the command; returns the exit status."""
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     torch.set_num_threads(1)
-    try:
-        check_ranges(args, RANGES, lambda name: f"--{name}")
-        check_task_id(args.env)
-        players = find_players(args)
-        if args.video is not None:
-            print(film(args, players[0]))
-            return 0
-        serve(Session(args.env, players, preset=args.preset, seed=args.seed), args.port, args.host)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return BAD_INPUT
+    check_ranges(args, RANGES, lambda name: f"--{name}")
+    check_task_id(args.env)
+    players = find_players(args)
+    if args.video is not None:
+        print(film(args, players[0]))
+        return 0
+    serve(Session(args.env, players, preset=args.preset, seed=args.seed), args.port, args.host)
     return 0

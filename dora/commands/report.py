@@ -1,6 +1,5 @@
 """Tables and figures of finished runs: `python experiments/report.py DIR`."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from dora.agents.runs.report import write_report
-from dora.errors import InputError
+from dora.errors import command
 
 
 @dataclass
@@ -21,13 +20,10 @@ class Arguments:
     """Folder for the report; the searched folder by default."""
 
 
+@command
 def main() -> int:
     """Run the command; returns the exit status."""
     arguments = tyro.cli(Arguments, description=__doc__)
-    try:
-        for path in write_report(arguments.dir, arguments.out or arguments.dir):
-            print(path)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    for path in write_report(arguments.dir, arguments.out or arguments.dir):
+        print(path)
     return 0

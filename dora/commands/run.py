@@ -34,7 +34,7 @@ from dora.agents.runs.recommended import learners_of, recommended
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.agents.runs.trainer import Trainer
 from dora.configs import plain
-from dora.errors import InputError, RunFailure
+from dora.errors import InputError, RunFailure, command
 from dora.tasks import find_task, make_task
 from dora.tasks.env.options import task_config
 from dora.tasks.mdp.guidance_parts import guidance_in_force
@@ -45,8 +45,6 @@ VIDEO_EPISODES = 3
 """Episodes of a film [1]."""
 FAILED = 1
 """Exit status of a run that cannot go on but can be resumed."""
-BAD_INPUT = 2
-"""Exit status after input that a person can mend."""
 ZERO = "zero"
 """Name of the agent that evaluates as zero correction."""
 ENTRANCES = ("--env", "--eval-only", "--checkpoint", "--resume")
@@ -257,6 +255,7 @@ def film(checkpoint: Path | None, config: RunConfig, path: Path, seed: int = FIN
     return True
 
 
+@command
 def main() -> int:
     """Run the command; returns the exit status."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
@@ -264,9 +263,6 @@ def main() -> int:
         with ending_at_once():
             args = parse(sys.argv[1:])
             folder, status = (evaluate_only(args), 0) if args.eval_only else train(args)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return BAD_INPUT
     except RunFailure as error:
         print(error, file=sys.stderr)
         return FAILED

@@ -11,7 +11,6 @@
 Runs until Ctrl-C.
 """
 
-import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,12 +26,10 @@ from dora.affordance.objects.importing import import_object
 from dora.affordance.views.album import write_album, write_objects
 from dora.affordance.views.page import GraspPage
 from dora.configs import check_ranges
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.robot import RobotDescription, load_robot
 from dora.tables import show_any_script
 
-BAD_INPUT = 2
-"""Exit status after an `InputError`."""
 RANGES = {"port": (1, 65_535), "scale": (1e-9, 1e9)}
 """Lowest and highest value of options."""
 GRASPS = ".safetensors"
@@ -98,24 +95,21 @@ def with_bundle(obj: AffordanceObject, robot: RobotDescription) -> tuple[Afforda
     return obj, None if path is None or not path.is_file() else GraspCandidates.load(path, obj, robot)
 
 
+@command
 def main() -> int:
     """Serve the page until Ctrl-C; returns the exit status."""
     description = f"{__doc__}\nObjects: {', '.join(available_objects())}."
     show_any_script()
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=description)
-    try:
-        check_ranges(args, RANGES, lambda name: f"--{name}")
-        if args.source is None and args.pictures is not None:
-            print(write_objects(args.pictures))
-            return 0
-        obj, candidates = content(args)
-        if args.pictures is not None:
-            print(*write_album(obj, candidates, load_robot(args.robot), args.pictures), sep="\n")
-            return 0
-        page = GraspPage(obj, candidates, load_robot(args.robot), args.port, args.host)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return BAD_INPUT
+    check_ranges(args, RANGES, lambda name: f"--{name}")
+    if args.source is None and args.pictures is not None:
+        print(write_objects(args.pictures))
+        return 0
+    obj, candidates = content(args)
+    if args.pictures is not None:
+        print(*write_album(obj, candidates, load_robot(args.robot), args.pictures), sep="\n")
+        return 0
+    page = GraspPage(obj, candidates, load_robot(args.robot), args.port, args.host)
     print(page.url, flush=True)
     try:
         threading.Event().wait()

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor
 
+from dora.arguments import as_array
 from dora.errors import InputError
 from dora.sim import BACKEND
 
@@ -166,15 +167,15 @@ class _Trace:
     """What all rows did since they were reset."""
 
     def __init__(self, obs: Any):
-        self._observations, self._pictures = [_array(_state(obs))], [_pictures(obs)]
+        self._observations, self._pictures = [as_array(_state(obs))], [_pictures(obs)]
         self._steps: dict[str, list[np.ndarray]] = {}
 
     def add(self, obs: Any, action: Any, reward: Any, terminated: Any, truncated: Any, success: Any) -> None:
-        self._observations.append(_array(_state(obs)))
+        self._observations.append(as_array(_state(obs)))
         self._pictures.append(_pictures(obs))
         values = {"actions": action, "rewards": reward, "terminated": terminated, "truncated": truncated}
         for name, value in {**values, "successes": success}.items():
-            self._steps.setdefault(name, []).append(_array(value))
+            self._steps.setdefault(name, []).append(as_array(value))
 
     def last(self, name: str) -> Bool[np.ndarray, " n"]:
         return self._steps[name][-1]
@@ -193,8 +194,4 @@ def _pictures(obs: Any) -> dict[str, np.ndarray]:
     """Pictures (n, h, w, 3) by the name of the camera, if there are any."""
     if not isinstance(obs, Mapping):
         return {}
-    return {name.removesuffix(CAMERA): _array(part["rgb"]) for name, part in obs["sensor_data"].items()}
-
-
-def _array(value: Any) -> np.ndarray:
-    return value.numpy(force=True).copy() if isinstance(value, Tensor) else np.array(value)
+    return {name.removesuffix(CAMERA): as_array(part["rgb"]) for name, part in obs["sensor_data"].items()}

@@ -8,8 +8,8 @@ import imageio.v2 as imageio
 import numpy as np
 from jaxtyping import UInt8
 
-MEGABYTE = 2**20
-"""Bytes of a megabyte [bytes]."""
+from dora.datasets.tables import MEGABYTE
+
 CODEC, PIXELS = "libx264", "yuv420p"
 """Encoder and form of the pixels; each picture has an even number of rows and columns."""
 SETTINGS = ("-g", "2", "-bf", "0", "-crf", "18")

@@ -13,8 +13,8 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
-from torch import Tensor
 
+from dora.arguments import as_array
 from dora.integrations.batches import make_batch
 
 
@@ -56,7 +56,7 @@ class BatchVecEnv(VecEnv):
         first = self._seeds[0]
         obs, _ = self.env.reset(seed=None if first is None else self._seeds)  # pyright: ignore[reportArgumentType]
         self._reset_seeds()
-        return _array(obs)
+        return as_array(obs)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Take the actions (n, a) of the next step."""
@@ -65,8 +65,8 @@ class BatchVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         """One control step: observations (n, o), rewards (n,), which episodes ended (n,), and infos."""
         obs, reward, terminated, truncated, info = self.env.step(self._actions)
-        over = _array(terminated) & (not self._ignore)
-        obs, ended = _array(obs), over | _array(truncated)
+        over = as_array(terminated) & (not self._ignore)
+        obs, ended = as_array(obs), over | as_array(truncated)
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
         rows = np.flatnonzero(ended)
         if len(rows):
@@ -74,8 +74,8 @@ class BatchVecEnv(VecEnv):
             for row in rows.tolist():
                 infos[row] = {"terminal_observation": obs[row].copy(), "TimeLimit.truncated": not over[row]}
                 infos[row] |= {} if success is None else {"is_success": bool(success[row])}
-            obs = np.where(ended[:, None], _array(self.env.reset(options={"env_idx": rows})[0]), obs)
-        return obs, _array(reward), ended, infos
+            obs = np.where(ended[:, None], as_array(self.env.reset(options={"env_idx": rows})[0]), obs)
+        return obs, as_array(reward), ended, infos
 
     def close(self) -> None:
         """Free the simulation."""
@@ -83,7 +83,7 @@ class BatchVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """A picture of each environment, of `render_mode="rgb_array"`."""
-        return list(_array(self.env.render()))
+        return list(as_array(self.env.render()))
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute of the batch, which its environments share, once for each of `indices`."""
@@ -120,7 +120,3 @@ class BatchVecEnv(VecEnv):
     def _check_all(self, indices: VecEnvIndices, what: str) -> None:
         if sorted(self._rows(indices)) != list(range(self.num_envs)):
             raise ValueError(f"The environments of a batch share the {what}: leave indices out.")
-
-
-def _array(values: Any) -> np.ndarray:
-    return values.numpy(force=True).copy() if isinstance(values, Tensor) else np.array(values)

@@ -9,7 +9,6 @@ policy fails at is counted here, on the same starts. `docs/policies.md` is made 
 import datetime
 import functools
 import os
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +22,7 @@ from dora.agents.evaluation.intervals import wilson
 from dora.agents.evaluation.play import evaluate_checkpoint
 from dora.agents.runs.run_results import DEFAULT_PRESET, Run, find_runs
 from dora.configs import plain
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.files import make_folder, write_bytes
 from dora.policies.card import HEADINGS, SECONDS_PER_MINUTE, Card, failure_causes
 from dora.policies.policy import bundled_files, bundled_ids
@@ -37,8 +36,6 @@ POLICY = "policy.safetensors"
 """Name of the policy in the folder of a committed run."""
 PAGE = Path("docs") / "policies.md"
 """Page with the table of all cards, in a checkout."""
-BAD_INPUT = 2
-"""Exit status after input that a person can mend."""
 
 
 @dataclass(frozen=True)
@@ -69,26 +66,23 @@ class Choice:
         return self.run.folder / POLICY
 
 
+@command
 def main() -> int:
     """Run the command; returns the exit status."""
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     commit = source_commit()  # before files of the checkout are replaced
-    try:
-        runs = find_runs(args.results)
-        for env_id in args.env or task_ids():
-            if (choice := chosen(runs, env_id)) is None:
-                if args.env:
-                    raise InputError(f"there is no run of {env_id} under {args.results} that a bundle may hold.")
-                continue
-            if not args.again and is_bundled(choice):
-                count_runs(choice)
-                print(f"{env_id}: {choice.run.folder} is bundled already (--again makes its card anew).")
-                continue
-            print(f"{env_id}: {choice.run.folder}, best of {choice.among}; counting what it fails at ...")
-            print(bundle(choice, args.results, commit, args.workers))
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return BAD_INPUT
+    runs = find_runs(args.results)
+    for env_id in args.env or task_ids():
+        if (choice := chosen(runs, env_id)) is None:
+            if args.env:
+                raise InputError(f"there is no run of {env_id} under {args.results} that a bundle may hold.")
+            continue
+        if not args.again and is_bundled(choice):
+            count_runs(choice)
+            print(f"{env_id}: {choice.run.folder} is bundled already (--again makes its card anew).")
+            continue
+        print(f"{env_id}: {choice.run.folder}, best of {choice.among}; counting what it fails at ...")
+        print(bundle(choice, args.results, commit, args.workers))
     if PAGE.is_file():
         write_bytes(PAGE, refreshed(PAGE.read_text(), cards_table()).encode())
     return 0

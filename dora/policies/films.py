@@ -20,7 +20,7 @@ from PIL import Image
 import dora
 from dora.agents.evaluation.evaluate import FINAL_SEED
 from dora.agents.evaluation.play import episode_frames
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.files import make_folder, write_bytes
 from dora.policies.policy import bundled_ids
 from dora.sim.batch.rendering import can_render
@@ -104,24 +104,21 @@ def strip(episode: Episode) -> Picture:
     return side_by_side([episode.pictures[place] for place in places])
 
 
+@command
 def main() -> None:
     """Film every bundled policy."""
     args = tyro.cli(Args, description=__doc__)
-    try:
-        if not can_render():
-            raise InputError("No film: SAPIEN finds no Vulkan driver here (docs/rendering.md).")
-        make_folder(args.out)
-        for env_id in bundled_ids():
-            episodes = film_episodes(env_id, args.episodes, args.seed)
-            name = short_name(env_id)
-            write_bytes(args.out / f"{name}.gif", as_gif(episodes))
-            imageio.imwrite(args.out / f"{name}-film.png", strip(episodes[0]))
-            outcome = ", ".join("succeeded" if episode.success else "failed" for episode in episodes)
-            print(f"{args.out / name}.gif: seeds from {args.seed}: {outcome}")
-    except InputError as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(2) from error
+    if not can_render():
+        raise InputError("No film: SAPIEN finds no Vulkan driver here (docs/rendering.md).")
+    make_folder(args.out)
+    for env_id in bundled_ids():
+        episodes = film_episodes(env_id, args.episodes, args.seed)
+        name = short_name(env_id)
+        write_bytes(args.out / f"{name}.gif", as_gif(episodes))
+        imageio.imwrite(args.out / f"{name}-film.png", strip(episodes[0]))
+        outcome = ", ".join("succeeded" if episode.success else "failed" for episode in episodes)
+        print(f"{args.out / name}.gif: seeds from {args.seed}: {outcome}")
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

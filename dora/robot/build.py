@@ -15,7 +15,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.files import write_bytes
 from dora.geometry.rotations import rpy_from_z_axis
 from dora.reading import read_yaml
@@ -164,17 +164,14 @@ def urdf_number(value: int | float) -> str:
     return f"{float(value) + 0.0:.12g}"
 
 
+@command
 def main() -> None:
     """Build the URDF of every folder named on the command line."""
     if len(sys.argv) < 2:
         raise SystemExit("usage: python -m dora.robot.build FOLDER [FOLDER ...]")
     for folder in sys.argv[1:]:
-        try:
-            print(write_urdf(Path(folder)))
-        except InputError as error:
-            print(error, file=sys.stderr)
-            raise SystemExit(2) from error
+        print(write_urdf(Path(folder)))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

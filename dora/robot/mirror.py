@@ -20,7 +20,7 @@ import numpy as np
 import tomli_w
 import trimesh
 
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.files import make_folder, write_bytes
 from dora.reading import read_toml
 from dora.robot.build import urdf_number
@@ -72,7 +72,7 @@ def mirrored_urdf(text: str, name: str, source: str) -> str:
                 element.set(key, mirrored_name(value))
         if element.tag in ("origin", "axis", "inertia"):
             _mirror(element, source)
-        if element.tag == "mesh" and (":" in element.get("filename", "") or ".." in element.get("filename", "")):
+        if element.tag == "mesh" and _is_outside(element.get("filename", "")):
             raise InputError(
                 f"the mesh {element.get('filename')} lies outside the folder of {source!r}; move it there."
             )
@@ -80,6 +80,11 @@ def mirrored_urdf(text: str, name: str, source: str) -> str:
     ET.indent(root)
     body = ET.tostring(root, encoding="unicode")
     return f'<?xml version="1.0"?>\n<!-- {HEADER.format(name=source)} -->\n{body}\n'
+
+
+def _is_outside(filename: str) -> bool:
+    """Whether what a URDF names is an address, or no place within the folder of the URDF."""
+    return ":" in filename or ".." in filename or Path(filename).is_absolute()
 
 
 def _mirror(element: ET.Element, source: str) -> None:
@@ -128,50 +133,61 @@ def mirrored_mesh(scene: trimesh.Scene) -> trimesh.Scene:
     return image
 
 
+def _mesh_image(path: Path) -> bytes:
+    """The image of a mesh file as glTF.
+
+    Raises:
+        InputError: there is no such file, it is not binary glTF, or it is damaged.
+    """
+    if path.suffix != ".glb" or not path.is_file():
+        raise InputError(f"the mesh {path} is {'no .glb file' if path.is_file() else 'missing'}; put one there.")
+    try:
+        image = mirrored_mesh(trimesh.load_scene(path))
+    except Exception as error:  # the reader raises whatever it meets in a damaged file
+        raise InputError(
+            f"the mesh {path} is no intact glTF ({type(error).__name__}: {error}); export it again."
+        ) from error
+    return cast(bytes, image.export(file_type="glb", include_normals=True))
+
+
 def write_mirrored(source: Path, target: Path) -> list[Path]:
     """Write the image of a robot folder; its name is that of the new folder.
 
     Args:
-        source: folder with `robot.toml`, a URDF and meshes.
+        source: folder with `robot.toml`, a URDF and the meshes that it names, as .glb; or the name of a robot.
         target: folder of the image; files that are there already are replaced.
 
     Returns:
         The written files.
 
     Raises:
-        InputError: the robot cannot be read, or the folder cannot be written.
+        InputError: the robot or one of its meshes cannot be read, or the folder cannot be written.
     """
     robot = load_robot(source)
-    if target.resolve() == source.resolve():
+    if target.resolve() == robot.folder:
         raise InputError(f"{target} is the robot itself; give the folder of its image another name.")
-    make_folder(target / "meshes")
     written: dict[Path, bytes] = {}
     urdf = mirrored_urdf(robot.urdf.read_text(), target.name, robot.name)
     written[target / mirrored_name(robot.urdf.name)] = urdf.encode()
-    table = mirrored_table(read_toml(source / ROBOT_FILE, "robot"), target.name)
+    table = mirrored_table(read_toml(robot.folder / ROBOT_FILE, "robot"), target.name)
     written[target / ROBOT_FILE] = f"# {HEADER.format(name=robot.name)}\n{tomli_w.dumps(table)}".encode()
     written[target / "SOURCE.md"] = SOURCE.format(name=robot.name, image=target.name).encode()
-    for mesh in sorted(robot.folder.glob("meshes/*.glb")):
-        scene = mirrored_mesh(trimesh.load_scene(mesh))
-        written[target / "meshes" / mirrored_name(mesh.name)] = cast(
-            bytes, scene.export(file_type="glb", include_normals=True)
-        )
+    for name in sorted({mesh.get("filename", "") for mesh in ET.parse(robot.urdf).iter("mesh")}):
+        written[target / mirrored_name(name)] = _mesh_image(robot.folder / name)
     for path, content in written.items():
+        make_folder(path.parent)
         write_bytes(path, content)
     return list(written)
 
 
+@command
 def main() -> None:
     """Write the image of the first folder that is named on the command line into the second one."""
     if len(sys.argv) != 3:
         raise SystemExit("usage: python -m dora.robot.mirror FOLDER FOLDER_OF_THE_IMAGE")
-    try:
-        for path in write_mirrored(Path(sys.argv[1]), Path(sys.argv[2])):
-            print(path, path.stat().st_size)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        raise SystemExit(2) from error
+    for path in write_mirrored(Path(sys.argv[1]), Path(sys.argv[2])):
+        print(path, path.stat().st_size)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

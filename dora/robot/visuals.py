@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.files import make_folder, write_bytes
 from dora.reading import read_yaml
 
@@ -188,18 +188,15 @@ def _material(name: str, row: Row) -> PBRMaterial:
     )
 
 
+@command
 def main() -> None:
     """Write the meshes of every folder named on the command line."""
     if len(sys.argv) < 2:
         raise SystemExit("usage: python -m dora.robot.visuals FOLDER [FOLDER ...]")
     for folder in sys.argv[1:]:
-        try:
-            for path in write_meshes(Path(folder)):
-                print(path, path.stat().st_size)
-        except InputError as error:
-            print(error, file=sys.stderr)
-            raise SystemExit(2) from error
+        for path in write_meshes(Path(folder)):
+            print(path, path.stat().st_size)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

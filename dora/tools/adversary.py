@@ -19,6 +19,7 @@ import tyro
 from jaxtyping import Float
 from torch import Tensor
 
+from dora.errors import command
 from dora.sim import BACKEND
 from dora.tasks import task_ids
 
@@ -123,6 +124,7 @@ class Args:
     """Seed of episodes and random actions."""
 
 
+@command
 def main() -> int:
     """Run the command; returns the exit status."""
     args, good = tyro.cli(Args, description=__doc__), True

@@ -12,15 +12,13 @@ from typing import Any, Generic, Literal, TypeVar
 
 import tyro
 
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.tasks import find_task, make_task
 from dora.tasks.env.options import task_config
 from dora.tools.arguments import early_value
 
 Numbers = TypeVar("Numbers")
 """Numbers of the task that is named."""
-BAD_INPUT = 2
-"""Exit status after input that a person can mend."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,21 +35,18 @@ class Args(Generic[Numbers]):
     """Numbers of the task."""
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Prints the tables of the task that is named first; returns the exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
-    try:
-        if not words or words[0].startswith("-"):
-            raise InputError("Say which task, for example: python -m dora.tools.describe DoraJug-v1")
-        cls, preset = find_task(words[0]).CONFIG, early_value(words, "--preset") or "standard"
-        form: Any = Args[cls]
-        default = Args(env=words[0], task=task_config(cls, preset, None))
-        args: Args = tyro.cli(form, default=default, description=__doc__, args=words)
-        options = {"guidance": args.guidance, "preset": args.preset, "config": args.task}
-        task = make_task(args.env, 1, sim_backend="physx_cpu", **options)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return BAD_INPUT
+    if not words or words[0].startswith("-"):
+        raise InputError("Say which task, for example: python -m dora.tools.describe DoraJug-v1")
+    cls, preset = find_task(words[0]).CONFIG, early_value(words, "--preset") or "standard"
+    form: Any = Args[cls]
+    default = Args(env=words[0], task=task_config(cls, preset, None))
+    args: Args = tyro.cli(form, default=default, description=__doc__, args=words)
+    options = {"guidance": args.guidance, "preset": args.preset, "config": args.task}
+    task = make_task(args.env, 1, sim_backend="physx_cpu", **options)
     print(task)
     task.close()
     return 0

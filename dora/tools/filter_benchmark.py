@@ -7,6 +7,7 @@ without the filter ("nearest"), and random ones, half of them rejected ("random"
 twice as often as what is accepted, or the filter does not pay.
 """
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -17,7 +18,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from dora.affordance.reach.approach_paths import OK, REASONS
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.progress import ProgressDisplay
 from dora.tables import text_table
 from dora.tasks import make_task
@@ -128,6 +129,7 @@ def outcome_rows(found: Outcomes) -> list[Sequence[str]]:
     return rows
 
 
+@command
 def main() -> None:
     """Print both comparisons."""
     args = tyro.cli(Args, description=__doc__)
@@ -139,4 +141,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

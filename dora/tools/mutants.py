@@ -21,7 +21,7 @@ from typing import Any
 
 import tyro
 
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.progress import ProgressDisplay
 from dora.tables import text_table
 from dora.tools.mutation.sites import Mutant, mutants_of
@@ -166,6 +166,7 @@ def rows(mutants: Iterable[Mutant], trials: Mapping[str, Trial]) -> list[Sequenc
     ]
 
 
+@command
 def main() -> int:
     """Draw, judge, and print the table; the exit status."""
     args = tyro.cli(Args, description=__doc__)
@@ -188,8 +189,5 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)

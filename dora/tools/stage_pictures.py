@@ -12,7 +12,7 @@ import imageio.v2 as imageio
 import numpy as np
 from jaxtyping import UInt8
 
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.sim.batch.rendering import can_render
 from dora.tasks import make_task, task_ids
 from dora.tasks.env.task import short_name
@@ -99,11 +99,11 @@ def _first(task: Any, draw: Callable[[Any], Picture]) -> list[Picture]:
     return frames
 
 
+@command
 def main(docs: Path) -> None:
     """Draws the stages of every registered task, and what its cameras see of them.
 
     Raises:
-        InputError: nothing can be rendered here.
         RuntimeError: the scripted solution of a task fails from all starts that are tried.
     """
     if not can_render():
@@ -122,7 +122,4 @@ def main(docs: Path) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path("docs"))
-    except InputError as error:
-        sys.exit(str(error))
+    sys.exit(main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path("docs")))

@@ -20,15 +20,13 @@ from dora.affordance.objects.catalogue import own_objects
 from dora.affordance.objects.folder_writing import write_object_folder
 from dora.affordance.objects.importing import import_mesh
 from dora.affordance.objects.models import cube, hammer, jug, microwave
-from dora.errors import InputError
+from dora.errors import InputError, command
 from dora.tables import show_any_script
 
 MODELS: dict[str, Callable[[], AffordanceObject]] = {
     "cube": cube.build, "hammer": hammer.build, "jug": jug.build, "microwave": microwave.build,
 }  # fmt: skip
 """What makes each object that is modelled here."""
-BAD_INPUT = 2
-"""Exit status after input that a person can mend."""
 
 
 @dataclass
@@ -83,15 +81,12 @@ def run(args: Args) -> list[Path]:
     return [write_object_folder(found.object, args.folders[0])]
 
 
+@command
 def main() -> int:
     """Run the command; returns the exit status."""
     show_any_script()
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
-    try:
-        print(*run(args), sep="\n")
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return BAD_INPUT
+    print(*run(args), sep="\n")
     return 0
 
 

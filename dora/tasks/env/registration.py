@@ -1,10 +1,10 @@
 """Registering a task: ManiSkill and gymnasium then make its environment by id."""
 
 import copy
-import dataclasses
+import traceback
 from collections.abc import Callable
 
-from gymnasium.envs.registration import EnvSpec, registry
+from gymnasium.envs.registration import EnvSpec, make_vec, registry
 from mani_skill.utils.registration import register_env
 
 from dora.tasks.env.env import DoraEnv
@@ -14,17 +14,20 @@ TASKS: dict[str, type[Task]] = {}
 """The registered tasks by their ids."""
 
 
-def _without_wrappers(spec: EnvSpec, memo: dict) -> EnvSpec:
-    """A copy of what is registered, without wrappers.
+def _deepcopy(spec: EnvSpec, memo: dict) -> EnvSpec:
+    """A copy of what is registered; without wrappers if `gymnasium.make_vec` asks for it, which refuses any.
 
-    `gymnasium.make_vec` copies it and refuses wrappers, which all ids of ManiSkill have for their time limit; the batch
-    that it makes is made by `gymnasium.make`, which gives it its limit.
+    All ids of ManiSkill have a wrapper, their time limit. What `make_vec` makes has its limit all the same: a batch is
+    made by `gymnasium.make` from the registered id, and a single environment has gymnasium's own limit.
     """
-    own = {field.name: getattr(spec, field.name) for field in dataclasses.fields(EnvSpec) if field.init}
-    return EnvSpec(**copy.deepcopy({**own, "additional_wrappers": ()}, memo))
+    twin = copy.copy(spec)
+    vars(twin).update(copy.deepcopy(vars(spec), memo))
+    if any(frame.f_code is make_vec.__code__ for frame, _ in traceback.walk_stack(None)):
+        twin.additional_wrappers = ()
+    return twin
 
 
-TaskSpec = type("TaskSpec", (EnvSpec,), {"__deepcopy__": _without_wrappers})
+TaskSpec = type("TaskSpec", (EnvSpec,), {"__deepcopy__": _deepcopy})
 """A registered id of which `gymnasium.make_vec` makes a batch; no statement, because beartype cannot check a class of
 gymnasium's."""
 
