@@ -212,6 +212,18 @@ def test_terms_grow_with_what_they_are_there_for_in_their_stage(name: str):
     assert TERMS[name].value(invented(**state)).tolist() == [0.0, 0.0]  # nothing before its stage
 
 
+@pytest.mark.parametrize("name", ["carry", "put"])
+def test_after_an_overlap_above_the_limit_the_cube_earns_less(name: str):
+    stage = {RIGHT: 2 if name == "carry" else 3}
+    stages = {arm: torch.full((2,), stage.get(arm, 0)) for arm in (LEFT, RIGHT)}
+    cube = {"p": in_world(-0.1, 0.0, 0.1)}
+    clean, deep = (
+        TERMS[name].value(invented(cube=cube, stages=stages, max_penetration=torch.tensor([0.004, 0.006]))).tolist()
+    )
+    assert deep == pytest.approx(CONFIG.after_overlap * clean)
+    assert clean > 0
+
+
 def test_no_term_leaves_its_bounds():
     generator = torch.Generator().manual_seed(0)
     for _ in range(20):

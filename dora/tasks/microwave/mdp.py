@@ -128,6 +128,8 @@ class MicrowaveConfig(TaskConfig):
     """Largest speed of a cube that lies [m/s]."""
     free_overlap: float = 0.001
     """Overlap that costs no reward [m]."""
+    after_overlap: float = 0.3
+    """Share of what carrying and putting in earns that is left once an overlap was above the limit [1]."""
     fewest: float = 0.5
     """Smallest share of its executions that a ranked candidate must have survived to be used, as a share of the best
     candidate's [1]."""
@@ -220,15 +222,21 @@ def terms(c: MicrowaveConfig) -> Terms[MicrowaveSnapshot]:
     def door(s: MicrowaveSnapshot) -> Tensor:
         return (s.door / c.open).clamp(0, 1) * (s.stage >= MOVE)
 
+    def clean(s: MicrowaveSnapshot) -> Tensor:
+        return torch.where(s.max_penetration <= c.penetration_limit, 1.0, c.after_overlap)
+
     def carry(s: MicrowaveSnapshot) -> Tensor:
         return (0.3 * rise(s, c.lift) + 0.7 * _before(s, c)) * (0.3 + 0.7 * opposed(s).float())
 
+    def carried(s: MicrowaveSnapshot) -> Tensor:
+        return while_active(MOVE, carry)(s) * clean(s)
+
     def put(s: MicrowaveSnapshot) -> Tensor:
-        return torch.where(inside(s), 1.0, 0.8 * _depth(s, c)) * (s.stage >= PUT)
+        return torch.where(inside(s), 1.0, 0.8 * _depth(s, c)) * (s.stage >= PUT) * clean(s)
 
     def placed(s: MicrowaveSnapshot) -> Tensor:
-        clean = (s.max_penetration <= c.penetration_limit) & (s.door >= c.open)
-        return (at_rest(s.of(RIGHT), c) & clean).float()
+        good = (s.max_penetration <= c.penetration_limit) & (s.door >= c.open)
+        return (at_rest(s.of(RIGHT), c) & good).float()
 
     def moved(s: MicrowaveSnapshot) -> Tensor:
         return (s.door > c.open / 4) if LEFT in s.hands else off_table(s) | inside(s)
@@ -258,10 +266,11 @@ def terms(c: MicrowaveConfig) -> Terms[MicrowaveSnapshot]:
             **each,
             "open": Term(seen_by(LEFT, door), w.open, doc="angle of the door, once the handle was grasped"),
             "carry": Term(
-                seen_by(RIGHT, while_active(MOVE, carry)), w.carry,
-                doc="rise of the cube and closeness to the place before the cavity, held by thumb and finger",
+                seen_by(RIGHT, carried), w.carry,
+                doc="rise of the cube and closeness to the place before the cavity, held by thumb and finger; less "
+                "after an overlap above the limit",
             ),
-            "put": Term(seen_by(RIGHT, put), w.put, doc="depth of the cube in the cavity; 1 if it is inside"),
+            "put": Term(seen_by(RIGHT, put), w.put, doc="depth of the cube in the cavity, 1 inside; less after an overlap"),
             "placed": Term(
                 placed, w.placed, doc="the cube lies inside, hand out, door open, no overlap above the limit so far"
             ),
