@@ -35,6 +35,7 @@ class Entry:
             guidance, all other guided entries belong to the part "observation".
         sensed: True if a robot knows it without looking: its joints, its commands, touch. It stays an observation
             beside pictures; all other entries are privileged, and left out where pictures are observed without state.
+        arm: name of the only arm that has it, where not all of them do.
     """
 
     value: Callable[[Any], Tensor]
@@ -44,6 +45,7 @@ class Entry:
     prior: bool = False
     region: bool = False
     sensed: bool = False
+    arm: str | None = None
 
     def exists(self, parts: frozenset[str]) -> bool:
         """Whether the entry exists with these parts of guidance."""
@@ -65,7 +67,7 @@ def observation_table(arms: Sequence[str], extra: Mapping[str, Entry], parts: fr
             f"{arm}/{name}": replace(entry, value=_as_observed_by(arm, entry))
             for arm in arms
             for name, entry in table.items()
-            if name not in SHARED_ENTRIES
+            if name not in SHARED_ENTRIES and entry.arm in (None, arm)
         }
         table = {**own, **{name: ARM_ENTRIES[name] for name in SHARED_ENTRIES}}
     return {name: entry for name, entry in table.items() if entry.exists(parts)}

@@ -314,7 +314,7 @@ def failed(s: Snapshot, memory: EpisodeMemory) -> Bool[Tensor, " n"]:
 
 
 OBSERVATIONS: dict[str, Entry] = {
-    "half": Entry(lambda s: s.object.half, "m", "half extents of the handle or cube"),
+    "half": Entry(lambda s: s.object.half[:, :1], "m", "half edge of the cube", arm=RIGHT),
     "oven": Entry(oven_in_hand, "m", "origin of the microwave's frame in the hand frame"),
     "into": Entry(into_oven_in_hand, "1", "direction into the cavity in the hand frame"),
     "in_oven": Entry(object_in_oven, "m", "handle or cube in the microwave's frame"),
