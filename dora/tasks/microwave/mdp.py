@@ -270,7 +270,9 @@ def terms(c: MicrowaveConfig) -> Terms[MicrowaveSnapshot]:
                 doc="rise of the cube and closeness to the place before the cavity, held by thumb and finger; less "
                 "after an overlap above the limit",
             ),
-            "put": Term(seen_by(RIGHT, put), w.put, doc="depth of the cube in the cavity, 1 inside; less after an overlap"),
+            "put": Term(
+                seen_by(RIGHT, put), w.put, doc="depth of the cube in the cavity; 1 inside, less after an overlap"
+            ),
             "placed": Term(
                 placed, w.placed, doc="the cube lies inside, hand out, door open, no overlap above the limit so far"
             ),
