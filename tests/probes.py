@@ -18,7 +18,8 @@ from tensordict import TensorDict
 
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.maps.affordance_map import AffordanceMap
-from dora.affordance.objects import decomposition
+from dora.affordance.objects import catalogue, decomposition
+from dora.affordance.objects.articulation import ARTICULATION_FILE, load_mount
 from dora.affordance.objects.folder_reading import read_object_folder
 from dora.affordance.objects.folder_writing import write_object_folder
 from dora.affordance.objects.importing import read_mesh
@@ -177,6 +178,18 @@ def load_object(folder: Path) -> object:
     return read_object_folder(folder / "box")
 
 
+def write_mounted(folder: Path) -> None:
+    """The handle of the microwave with what it is mounted on."""
+    microwave = catalogue.load_object("microwave")
+    write_object_folder(microwave, folder / "microwave")
+    assert microwave.folder is not None
+    shutil.copy(microwave.folder / ARTICULATION_FILE, folder / "microwave")
+
+
+def load_mounted(folder: Path) -> Any:
+    return load_mount(read_object_folder(folder / "microwave"))
+
+
 def box() -> trimesh.Trimesh:
     return trimesh.creation.box((0.05, 0.06, 0.07))
 
@@ -257,6 +270,7 @@ LOADERS: dict[str, Loader] = {
     "robot.urdf": Loader(write_robot, load_robot, ("robot.urdf",)),
     "parameters.yaml": Loader(write_parameters, write_urdf, ("parameters.yaml",)),
     "object.toml": Loader(write_object, load_object, ("object.toml",)),
+    "articulation.toml": Loader(write_mounted, load_mounted, ("articulation.toml",)),
     "object meshes": Loader(write_object, load_object, ("*.ply",)),
     **{
         f"mesh .{end}": Loader(with_ending(write_mesh, end), with_ending(load_mesh, end))

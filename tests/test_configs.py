@@ -1,6 +1,6 @@
 """Numbers of tasks as configuration: overridden by name, checked, shown, and in force."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gymnasium as gym
 import pytest
@@ -14,7 +14,7 @@ from dora.tasks import find_task, make_task, task_ids
 from dora.tasks.cube import CubeConfig
 from dora.tasks.env.options import task_config
 from dora.tasks.hammer.task import HammerConfig
-from dora.tasks.mdp.randomisation import PRESETS, Randomisation
+from dora.tasks.mdp.randomisation import PRESETS
 from dora.tools import describe
 
 assert dora
@@ -109,11 +109,13 @@ def test_plain_data_make_the_same_configuration_again():
 @pytest.mark.parametrize("env_id", task_ids())
 def test_the_preset_is_the_randomisation_that_can_be_overridden(env_id: str):
     cls = find_task(env_id).CONFIG
-    for name, randomisation in PRESETS.items():
+    for name, randomisation in cls.PRESETS.items():
         assert task_config(cls, name, None).randomisation == randomisation
+        shared = plain(PRESETS[name])
+        assert {key: plain(randomisation)[key] for key in shared} == shared
     changed = task_config(cls, "hard", {"randomisation": {"push": 0.5}}).randomisation
     assert (changed.push, changed.delay) == (0.5, PRESETS["hard"].delay)
-    assert changed == Randomisation(**(plain(PRESETS["hard"]) | {"push": 0.5, "friction": PRESETS["hard"].friction}))
+    assert changed == replace(cls.PRESETS["hard"], push=0.5)
 
 
 @pytest.mark.parametrize(

@@ -143,11 +143,13 @@ def load_mount(obj: AffordanceObject) -> Mount:
     """
     if obj.folder is None or not (obj.folder / ARTICULATION_FILE).is_file():
         raise InputError(f"the object {obj.name!r} is not mounted on anything: its folder has no {ARTICULATION_FILE}.")
-    return _read(obj.folder / ARTICULATION_FILE)
+    path = obj.folder / ARTICULATION_FILE
+    return _read(path, path.stat().st_mtime_ns)
 
 
 @functools.cache
-def _read(path: Path) -> Mount:
+def _read(path: Path, time: int) -> Mount:
+    """The mount of a file as it was at a time of its last change."""
     content = read_toml(path, "file about what an object is mounted on")
     if content.get("format") != FORMAT:
         raise InputError(f"{path}: the format is {shown(content.get('format'))}, not {FORMAT!r}.")

@@ -20,6 +20,8 @@ from dora.tasks.mdp.randomisation import find_preset
 
 RATES = {"control_frequency": (1, 10_000), "physics_frequency": (1, 1_000_000), "solver_iterations": (1, 255)}
 """Lowest and highest rates [Hz], and position iterations, of which PhysX takes 255."""
+SHARES = ("size", "mass", "hinge")
+"""Half widths of the randomisation that are shares of what they change; a task may lack some."""
 MOST_DELAY = 1000
 """Largest delay of an action [control steps]."""
 MOST_ENVS = 100_000
@@ -51,9 +53,8 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Any) -> TaskConfig:
     check_not_negative(config, "config")
     check_not_negative(config.residual, "config.residual")
     check_not_negative(config.randomisation, "config.randomisation")
-    for name in ("size", "mass"):
-        if getattr(config.randomisation, name) >= 1:
-            width = getattr(config.randomisation, name)
+    for name in SHARES:
+        if (width := getattr(config.randomisation, name, 0.0)) >= 1:
             raise InputError(f"config.randomisation.{name} is {width}; it is a share and has to be below 1.")
     low, high = config.randomisation.friction
     if not 0 <= low <= high:
