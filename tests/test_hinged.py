@@ -134,8 +134,8 @@ def test_every_environment_has_a_door_of_its_own():
         num_envs=3, sim_backend="physx_cpu_batch", render_backend="none", obs_mode="none", reward_mode="none"
     )
     env.reset(seed=0)
-    env.pull = np.array([0.0, 20.0, 10.0])
-    env.run(0.5)
+    env.pull = np.array([0.0, 12.0, 8.0])
+    env.run(0.3)
     shut, wide, half = env.oven.angle.tolist()
     assert abs(shut) < 0.01 < half < wide
     env.close()
