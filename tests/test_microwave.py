@@ -9,6 +9,7 @@ from invented import GOAL_SHAPES, HAND_SHAPES, OBJECT_SHAPES, SHARED_SHAPES, TIP
 from torch import Tensor
 
 import dora.tasks as tasks
+from dora.affordance.candidates import hand_digest
 from dora.geometry.poses import compose
 from dora.geometry.rotations import (
     quaternion_apply,
@@ -16,6 +17,7 @@ from dora.geometry.rotations import (
     quaternion_multiply,
     rotation_angle,
 )
+from dora.robot import load_robot
 from dora.tasks.mdp.snapshot import GoalState, HandState, ObjectState
 from dora.tasks.microwave import mdp
 from dora.tasks.microwave.mdp import MicrowaveConfig
@@ -148,13 +150,15 @@ def test_the_cube_is_carried_in_with_the_fingers_ahead():
 def test_mirrored_candidates_are_mirror_images():
     """A point of the mirrored hand is the mirror image of the same point of the hand."""
     found = tasks.find_task("DoraMicrowave-v1")(CONFIG).candidates(RIGHT).select(slice(4))
-    image = mirrored(found)
+    left, right = load_robot("diana7_hit_left"), load_robot("diana7_hit")
+    image = mirrored(found, left)
     flip = torch.tensor([1.0, -1.0, 1.0])
     point = torch.tensor([0.05, 0.02, 0.11]).repeat(4, 1)
     there, _ = compose((image.position, image.quaternion), (point * flip, image.quaternion))
     here, _ = compose((found.position, found.quaternion), (point, found.quaternion))
     torch.testing.assert_close(there, here * flip, atol=1e-6, rtol=0)
-    assert torch.equal(mirrored(image).position, found.position)
+    assert torch.equal(mirrored(image, right).position, found.position)
+    assert (image.robot, image.robot_digest) == ("diana7_hit_left", hand_digest(left))
 
 
 # ------------------------------------------------------------------------ stages

@@ -13,7 +13,7 @@ from mani_skill.utils.structs import Actor, Link, Pose
 from torch import Tensor
 
 from dora.affordance.bundled_sets import best_candidates
-from dora.affordance.candidates import GraspCandidates
+from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.objects.articulation import Mount, load_mount
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.feasibility_table import Grid
@@ -100,8 +100,8 @@ class MicrowaveTask(Task):
         return best_candidates(self.ARMS[arm].object, CLASSES[arm], c.fewest, c.most_candidates, region, task)
 
     def adapted(self, candidates: GraspCandidates, arm: str, robot: RobotDescription) -> GraspCandidates:
-        """The left hand is the mirror image of the right one, for which the candidates were found."""
-        return mirrored(candidates) if arm == LEFT else candidates
+        """The left hand is the mirror image of the right one, for which the bundled candidates were found."""
+        return mirrored(candidates, robot) if arm == LEFT and candidates.robot != robot.name else candidates
 
     def make_reference(self, scene: TaskScene, arm: str) -> Reference:
         c: MicrowaveConfig = self.config
@@ -212,9 +212,14 @@ def oven_mount() -> Mount:
     return load_mount(load_object("microwave"))
 
 
-def mirrored(candidates: GraspCandidates) -> GraspCandidates:
+def mirrored(candidates: GraspCandidates, robot: RobotDescription) -> GraspCandidates:
     """The candidates of a hand as those of its mirror image, for an object that is its own mirror image about the plane
-    y = 0 of its frame: positions (x, -y, z), quaternions (w, -x, y, -z), the joints unchanged."""
+    y = 0 of its frame: positions (x, -y, z), quaternions (w, -x, y, -z), the joints unchanged.
+
+    Args:
+        candidates: of a hand.
+        robot: the mirror image of its robot.
+    """
     flip = torch.tensor([1.0, -1.0, 1.0])
     turn = torch.tensor([1.0, -1.0, 1.0, -1.0])
     return replace(
@@ -223,4 +228,6 @@ def mirrored(candidates: GraspCandidates) -> GraspCandidates:
         quaternion=candidates.quaternion * turn,
         approach=candidates.approach * flip,
         contacts=candidates.contacts * flip,
+        robot=robot.name,
+        robot_digest=hand_digest(robot),
     )
