@@ -94,7 +94,7 @@ print(config.agent, config.task["lift"])
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("grasps=load_candidates('cube')", "grasps are of one arm, and there are left, right"),
+        ("grasps=load_candidates('cube')", "grasps must be a dictionary by arm, and there are left, right"),
         ("robot_uids=('diana7_hit',)", "one robot for each of 2 arms, not 1"),
     ],
 )

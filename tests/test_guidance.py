@@ -207,7 +207,7 @@ def test_a_start_without_a_reachable_candidate_fails_and_earns_nothing(parts: tu
     task = tasks.make_task("DoraCube-v1", 3, guidance_parts=parts)
     able = torch.tensor([[True], [False], [True]])
     count = len(task.guide.choice.candidates)
-    task.task.reachable = lambda arm, p, q: able.repeat_interleave(len(p) // 3, 0).expand(-1, count)
+    task.task.reachable = lambda arm, rows, p, q: able[rows].expand(-1, count)
     task.reset(seed=0)
     _, reward, terminated, _, info = task.step(torch.zeros(3, task.action_size))
     filtered = parts is None

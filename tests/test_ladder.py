@@ -51,8 +51,8 @@ def test_a_start_without_a_reachable_candidate_fails_at_once_and_earns_nothing(m
     task = tasks.make_task("DoraCube-v1", 2, preset="none")
     able = task.task.reachable
 
-    def none_for_the_second(arm: Any, p: Tensor, q: Tensor) -> Tensor:
-        return able(arm, p, q) & torch.tensor([[True], [False]])
+    def none_for_the_second(arm: Any, rows: Tensor, p: Tensor, q: Tensor) -> Tensor:
+        return able(arm, rows, p, q) & torch.tensor([[True], [False]])
 
     monkeypatch.setattr(task.task, "reachable", none_for_the_second)
     task.reset(seed=0)
@@ -70,7 +70,7 @@ def test_the_filter_leaves_only_what_it_accepts(monkeypatch: pytest.MonkeyPatch)
     for name, given in (("filtered", None), ("free", parts)):
         task = tasks.make_task("DoraJug-v1", 64, guidance_parts=given)
 
-        def every_second(arm: Any, p: Tensor, q: Tensor) -> Tensor:
+        def every_second(arm: Any, rows: Tensor, p: Tensor, q: Tensor) -> Tensor:
             mask = torch.zeros(len(p), len(arm.guide.choice.candidates), dtype=torch.bool)
             mask[:, ::2] = True
             return mask
