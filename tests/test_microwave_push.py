@@ -1,5 +1,7 @@
 """A hand that is pushed into the shut door of the microwave at full speed goes neither through it nor deep into it."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -82,8 +84,8 @@ def test_a_hand_that_is_pushed_into_the_door_stops_at_it():
             rows = [names.index(name) for name in names if name.startswith(RIGHT)]
             pressed = contacts.impulse[:, rows, names.index("world")].sum(1).norm(dim=-1) * task.sim_freq
             force = torch.maximum(force, pressed)
-    door = task.snapshot.door
-    beyond = in_oven(task.snapshot, task.snapshot.wrists[:, 1])[:, 0]
+    end: Any = task.snapshot
+    door, beyond = end.door, in_oven(end, end.wrists[:, 1])[:, 0]
     for (name, way), deep, newtons in zip(CASES, deepest.tolist(), force.tolist(), strict=True):
         print(f"{name}, {way}: {deep:.1f} mm, {newtons:.0f} N")
     assert deepest.max() <= DEEPEST
