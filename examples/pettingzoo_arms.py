@@ -1,4 +1,4 @@
-"""PettingZoo plays the arms of a task as agents: `python examples/pettingzoo_arms.py --env ID`.
+"""PettingZoo plays the arms of a task as agents: `python examples/pettingzoo_arms.py`.
 
 Needs PettingZoo: `pip install 'dora-manipulation[pettingzoo]'`.
 """
@@ -10,7 +10,7 @@ import numpy as np
 from dora.integrations.pettingzoo import make
 
 parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--env", default="DoraCube-v1", help="id of Dora; of several arms, each is an agent")
+parser.add_argument("--env", default="DoraMicrowave-v1", help="id of Dora, in which each arm is an agent")
 parser.add_argument("--episodes", type=int, default=3)
 args = parser.parse_args()
 

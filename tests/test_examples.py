@@ -13,7 +13,7 @@ DEMO = Path(__file__).parent.parent / "examples" / "demo_robot.py"
 EXAMPLES = {
     "demo_robot": (["--help"], "--keyframe-actions"),  # it wants a screen: more of it is tried above
     "own_energy": ([], "with weight 200 the energy is 0."),
-    "pettingzoo_arms": (["--episodes", "1"], "agents: arm; state of 211 numbers"),
+    "pettingzoo_arms": (["--episodes", "1"], "agents: left, right; state of"),
     "skrl_ppo": (["--steps", "256", "--num-envs", "4", "--episodes", "4"], "after 256 steps: return"),
     "stable_baselines": (["--steps", "256", "--num-envs", "4", "--episodes", "4"], "of 4 episodes"),
     "third_party_task": ([], "4 of 4 palms came to their cubes"),

@@ -2,7 +2,7 @@
 
 from dora.integrations.pettingzoo import make
 
-env = make(ID)  # agents such as "left" and "right"
+env = make("DoraMicrowave-v1")  # agents "left" and "right"
 observations, infos = env.reset(seed=0)
 """
 
