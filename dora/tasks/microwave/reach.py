@@ -104,6 +104,8 @@ def opening_way(hinge: Pose, handle: Pose, back: float, target: float) -> Way:
     """
 
     def way(candidates: GraspCandidates, p: Tensor, q: Tensor) -> list[Pose]:
+        """World wrist poses (m, c, 3) [m], (m, c, 4) wxyz before the handle and along the arc, as `Way`."""
+
         def at(angle: float) -> Pose:
             spin = torch.tensor([0.0, 0.0, -angle]).expand(len(p), 3)
             door = compose((p, q), (hinge[0].expand(len(p), 3), hinge[1].expand(len(p), 4)))
@@ -130,6 +132,7 @@ def placing_way(front: float, depth: float, height: float) -> Way:
     """
 
     def way(candidates: GraspCandidates, p: Tensor, q: Tensor) -> list[Pose]:
+        """World wrist poses (m, c, 3) [m], (m, c, 4) wxyz from before the cavity into it, as `Way`."""
         fingers = quaternion_apply(candidates.quaternion, torch.tensor([0.0, 0.0, 1.0]).expand(len(candidates), 3))
         spin = torch.zeros_like(fingers)
         spin[:, 2] = -torch.atan2(fingers[:, 1], fingers[:, 0])

@@ -104,6 +104,7 @@ class MicrowaveTask(Task):
         return mirrored(candidates, robot) if arm == LEFT and candidates.robot != robot.name else candidates
 
     def make_reference(self, scene: TaskScene, arm: str) -> Reference:
+        """The left arm opens the door and holds it, the right one waits for that with the cube."""
         c: MicrowaveConfig = self.config
         if arm == LEFT:
             hinge = torch.tensor(oven_mount().hinge_link.position, device=scene.device)
