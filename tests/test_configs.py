@@ -90,7 +90,7 @@ def test_numbers_that_make_no_sense_are_refused(changes: dict, words: str):
     [
         ("ppo", "gamma", 2.0), ("sac", "gamma", float("nan")), ("ppo", "minibatch", 0), ("sac", "n_step", 0),
         ("sac", "polyak", -0.1), ("ppo", "learning_rate", 0.0), ("ppo", "noise_correlation", 1.0),
-        ("sac", "hidden", (256, 0)), ("ppo", "target_kl", float("inf")),
+        ("sac", "hidden", (256, 0)), ("ppo", "target_kl", float("inf")), ("ppo", "clip", 1.0), ("happo", "clip", 1.0),
     ],
 )  # fmt: skip
 def test_settings_of_a_learner_that_make_no_sense_are_refused(agent: str, name: str, value: object):

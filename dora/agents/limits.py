@@ -45,7 +45,7 @@ LEARNER = {
     "learning_rate_alpha": RATE,
     "updates_per_step": RATE,
     "grad_norm": (1e-12, 1e9),
-    "clip": RATE,
+    "clip": (1e-6, 0.999),  # TorchRL takes log(1 - clip)
     "target_kl": RATE,
     "alpha": RATE,
     "entropy": (-1e6, 1e6),
