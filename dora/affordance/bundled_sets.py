@@ -50,7 +50,8 @@ def best_candidates(
         least: smallest score (share of executions that succeeded), as a share of the best one's; candidates without a
             score are left out.
         most: largest number of candidates.
-        region, task: as for `bundled_path`; without region candidates of all classes are taken.
+        region: as for `bundled_path`; without it candidates of all classes are taken.
+        task: as for `bundled_path`.
     """
     found = load_candidates(name, region=region, task=task)
     found = found.select(found.of_class(grasp_class)) if region else found
@@ -65,7 +66,8 @@ def load_candidates(
     Args:
         name: of an object or its folder, as for `load_object`.
         robot: that has to fit (default diana7_hit).
-        region, task: as for `bundled_path`.
+        region: as for `bundled_path`.
+        task: as for `bundled_path`.
 
     Raises:
         InputError: unknown object, no candidates, or candidates that do not fit the object or the robot.
