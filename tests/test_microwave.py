@@ -117,9 +117,34 @@ def test_the_door_is_observed_from_the_pose_of_the_handle(angle: float):
     """The handle of a door that has opened by an angle is turned by it against the vertical."""
     shut = quaternion_multiply(turned(YAW), torch.tensor(oven_mount().object_link.quaternion).expand(2, 4))
     s = invented(handle={"q": quaternion_multiply(turned(-angle), shut)}, cube={"p": in_world(0.1, 0.0, 0.0)})
-    seen = s.reobserved()
+    seen = s.reobserved(lambda pose: pose)
     torch.testing.assert_close(seen.door, torch.full((2,), angle), atol=1e-5, rtol=0)
     torch.testing.assert_close(seen.cube_p, s.objects["cube"].p)
+
+
+def test_the_microwave_is_observed_where_it_was_located():
+    """A microwave that seems to be turned by .1 rad has a door that seems to be opened by .1 rad more."""
+    shut = quaternion_multiply(turned(YAW), torch.tensor(oven_mount().object_link.quaternion).expand(2, 4))
+    s = invented(handle={"q": shut})
+    seen = s.reobserved(lambda pose: (pose[0] + 0.01, quaternion_multiply(turned(0.1), pose[1])))
+    torch.testing.assert_close(seen.oven_p, s.oven_p + 0.01)
+    torch.testing.assert_close(seen.door, torch.full((2,), 0.1), atol=1e-5, rtol=0)
+
+
+def test_where_the_microwave_is_believed_to_be_stays_for_the_episode():
+    r = MicrowaveConfig.PRESETS["standard"]
+    task = tasks.make_task("DoraMicrowave-v1", 4)
+    task.reset(seed=0)
+    errors = []
+    for _ in range(3):
+        errors.append(task.observed.oven_p - task.snapshot.oven_p)
+        task.step(torch.zeros(4, task.action_size))
+    assert torch.equal(errors[0], errors[1]) and torch.equal(errors[0], errors[2])
+    assert 0 < errors[0].abs().max() <= r.observed_position
+    assert not torch.equal(errors[0][0], errors[0][1])
+    task.reset(seed=1)
+    assert not torch.equal(errors[0], task.observed.oven_p - task.snapshot.oven_p)
+    task.close()
 
 
 def test_what_is_led_with_the_door_keeps_its_place_on_it():

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dora.geometry.poses import Pose
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.tasks.guidance.candidate_choice import CandidateChoice
 from dora.tasks.mdp.buffers import Buffers
@@ -27,6 +28,8 @@ GOLDEN = 0x9E3779B9
 """2^32 over the golden ratio: multiples of it are spread evenly."""
 OBJECT_DRAWS, PUSH_DRAWS = 6, 2
 """Random numbers of a control step: position and rotation of each object; whether and where to push it."""
+STILL = 2**20
+"""Number of the control step, larger than that of any, from which errors are drawn that stay for an episode."""
 
 
 def _mixed(word: Tensor) -> Tensor:
@@ -98,6 +101,7 @@ class Perturbations:
 
     def observed(self, s: S, choices: Mapping[str, CandidateChoice], step: Int[Tensor, " n"]) -> S:
         """The state as it is observed: poses of handled objects, all that follows from them, and hand joints are noisy.
+        The pose of a body that stands still has as large an error, which stays the same in the whole episode.
 
         Args:
             s: the true state.
@@ -111,9 +115,7 @@ class Perturbations:
         hands, objects, goals = dict(s.hands), dict(s.objects), dict(s.goals)
         for arm, error in zip(self._sensors, errors, strict=True):
             body, name = s.objects[s.handles[arm]], s.handles[arm]
-            position = body.p + r.observed_position * error[:, :3]
-            tilt = quaternion_from_rotation_vector(r.observed_rotation * error[:, 3:6])
-            quaternion = quaternion_multiply(body.q, tilt)
+            position, quaternion = self._displaced((body.p, body.q), error)
             nearest_p, nearest_q, approach = choices[arm].goals(position, quaternion)
             objects[name] = replace(body, p=position, q=quaternion)
             hands[arm] = replace(s.hands[arm], q=s.hands[arm].q + r.observed_joint * error[:, OBJECT_DRAWS:])
@@ -125,4 +127,11 @@ class Perturbations:
                 nearest_p=nearest_p,
                 nearest_q=nearest_q,
             )
-        return observed(s, hands, objects, goals)
+        still = 2 * self._draws(torch.full_like(step, STILL), 0, OBJECT_DRAWS) - 1
+        return observed(s, hands, objects, goals, lambda pose: self._displaced(pose, still))
+
+    def _displaced(self, pose: Pose, error: Float[Tensor, "n numbers"]) -> Pose:
+        """The pose with an error; the first six numbers of `error` are in [-1, 1)."""
+        r = self.randomisation
+        tilt = quaternion_from_rotation_vector(r.observed_rotation * error[:, 3:OBJECT_DRAWS])
+        return pose[0] + r.observed_position * error[:, :3], quaternion_multiply(pose[1], tilt)

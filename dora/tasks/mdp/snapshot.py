@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dora.geometry.poses import Pose
+
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 """Finger order of every tensor with a finger axis; a robot's fingers are in this order."""
 CONTACT_CLASSES = ("none", "palm", *FINGERS)
@@ -169,8 +171,13 @@ class Snapshot:
             views[arm] = _sharing(former[arm], view, *shared) if arm in former else view
         return views[arm]
 
-    def reobserved(self: "S") -> "S":
-        """The same with what a task derives from poses in `extended`, after noise was added to them; itself here."""
+    def reobserved(self: "S", located: Callable[[Pose], Pose]) -> "S":
+        """The same with what a task added in `extended`, after noise was added to hands and objects; itself here.
+
+        Args:
+            located: pose of a body that stands still -> the same as it is observed, with one error in all steps of an
+                episode.
+        """
         return self
 
 
@@ -224,10 +231,16 @@ def advanced(s: S, stage: Tensor, stages: Mapping[str, Tensor], phases: Mapping[
 
 
 def observed(
-    s: S, hands: Mapping[str, HandState], objects: Mapping[str, ObjectState], goals: Mapping[str, GoalState]
+    s: S,
+    hands: Mapping[str, HandState],
+    objects: Mapping[str, ObjectState],
+    goals: Mapping[str, GoalState],
+    located: Callable[[Pose], Pose],
 ) -> S:
-    """The snapshot with noise in poses and joints; what was derived from contacts alone stays."""
-    return _sharing(s, replace(s, hands=hands, objects=objects, goals=goals).reobserved(), FROM_CONTACTS)
+    """The snapshot with noise in poses and joints; what was derived from contacts alone stays. `located` is that of
+    `Snapshot.reobserved`."""
+    noisy = replace(s, hands=hands, objects=objects, goals=goals).reobserved(located)
+    return _sharing(s, noisy, FROM_CONTACTS)
 
 
 def _sharing(old: S, new: S, *places: str) -> S:

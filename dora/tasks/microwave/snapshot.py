@@ -3,12 +3,14 @@
 The microwave's frame: origin in its front plane at the bottom, +x into the cavity, +z up; the door's hinge is at +y.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dora.geometry.poses import Pose
 from dora.geometry.rotations import (
     quaternion_apply,
     quaternion_inverse,
@@ -29,7 +31,8 @@ class MicrowaveSnapshot(Snapshot):
     """A snapshot with the microwave.
 
     Attributes:
-        oven_p, oven_q: pose of its frame in the world [m], wxyz.
+        oven_p, oven_q: pose of its frame in the world [m], wxyz; as observed, with an error that stays the same in the
+            whole episode.
         door: angle of the door [rad], 0 when it is shut; as observed, from the observed pose of the handle.
         door_speed: [rad/s].
         wrists: positions of all wrists [m], world frame, in the order of the arms.
@@ -51,13 +54,14 @@ class MicrowaveSnapshot(Snapshot):
     bar_radius: float
     shut_q: Float[Tensor, " 4"]
 
-    def reobserved(self) -> "MicrowaveSnapshot":
-        """The same with door and cube as the noisy poses of handle and cube tell."""
-        shut = quaternion_multiply(self.oven_q, self.shut_q.expand_as(self.oven_q))
-        turned = quaternion_multiply(quaternion_inverse(self.oven_q), _turn(shut, self.objects["microwave"].q))
-        turned = quaternion_multiply(turned, self.oven_q)
+    def reobserved(self, located: Callable[[Pose], Pose]) -> "MicrowaveSnapshot":
+        """The same with the microwave as it is observed, and door and cube as the noisy poses of handle and cube tell."""
+        oven_p, oven_q = located((self.oven_p, self.oven_q))
+        shut = quaternion_multiply(oven_q, self.shut_q.expand_as(oven_q))
+        turned = quaternion_multiply(quaternion_inverse(oven_q), _turn(shut, self.objects["microwave"].q))
+        turned = quaternion_multiply(turned, oven_q)
         angle = -rotation_vector_from_quaternion(turned)[:, 2]  # the door opens against +z
-        return replace(self, door=angle, cube_p=self.objects["cube"].p)
+        return replace(self, oven_p=oven_p, oven_q=oven_q, door=angle, cube_p=self.objects["cube"].p)
 
 
 def _turn(a: Tensor, b: Tensor) -> Tensor:
