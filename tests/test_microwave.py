@@ -139,7 +139,8 @@ def test_where_the_microwave_is_believed_to_be_stays_for_the_episode():
     for _ in range(3):
         errors.append(task.observed.oven_p - task.snapshot.oven_p)
         task.step(torch.zeros(4, task.action_size))
-    assert torch.equal(errors[0], errors[1]) and torch.equal(errors[0], errors[2])
+    assert torch.equal(errors[0], errors[1])
+    assert torch.equal(errors[0], errors[2])
     assert 0 < errors[0].abs().max() <= r.observed_position
     assert not torch.equal(errors[0][0], errors[0][1])
     task.reset(seed=1)

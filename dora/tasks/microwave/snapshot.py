@@ -55,7 +55,7 @@ class MicrowaveSnapshot(Snapshot):
     shut_q: Float[Tensor, " 4"]
 
     def reobserved(self, located: Callable[[Pose], Pose]) -> "MicrowaveSnapshot":
-        """The same with the microwave as it is observed, and door and cube as the noisy poses of handle and cube tell."""
+        """The same with the observed pose of the microwave, and door and cube as those of handle and cube tell."""
         oven_p, oven_q = located((self.oven_p, self.oven_q))
         shut = quaternion_multiply(oven_q, self.shut_q.expand_as(oven_q))
         turned = quaternion_multiply(quaternion_inverse(oven_q), _turn(shut, self.objects["microwave"].q))
