@@ -20,6 +20,7 @@ COMMANDS = {
     "grasps": "search for grasps of an object, judge them, and store them",
     "view": "show an object, its regions and its grasps on a web page",
     "bench": "measure how fast the parts of Dora are",
+    "sweep": "train all runs of a table, and go on where an earlier call stopped",
     "report": "make tables and figures of finished runs",
 }
 """What `dora NAME` does; the body of each is the module `dora.commands.NAME`."""

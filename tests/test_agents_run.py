@@ -1,5 +1,6 @@
 """The run command refuses bad input with one sentence and exit status 2."""
 
+import copy
 import dataclasses
 import json
 import re
@@ -15,7 +16,7 @@ from fake_task import PointMass
 
 import dora.agents
 from dora.agents.checkpoint import read_checkpoint
-from dora.agents.config import LEARNER_CONFIGS, config_from_dict
+from dora.agents.config import LEARNER_CONFIGS, NEUTRAL, config_from_dict, stored_digests
 from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed
 from dora.agents.evaluation.play import load_policy
 from dora.agents.runs.recommended import learners_of, recommended
@@ -273,9 +274,14 @@ def test_the_reward_of_the_paper_trains(script: ModuleType, tmp_path: Path, monk
 
 def test_settings_without_a_reward_mean_the_dense_one_and_keep_their_digest():
     config = run.parse(["--env", "DoraCube-v1"]).run
-    content = plain(config)
+    content = copy.deepcopy(plain(config))
     assert content.pop("reward") == "dense"
     assert config_from_dict(content) == config
     del content["total_steps"]
-    assert config.digest() == digest_of(content)[:12]
+    whole = digest_of(content)[:12]
+    assert content["task"].pop("arm_effort") == NEUTRAL["arm_effort"]
+    assert config.digest() == digest_of(content)[:12] == stored_digests(content)[0]
+    assert whole in stored_digests(plain(config))
+    weaker = dataclasses.replace(config, task=config.task | {"arm_effort": 0.5})
+    assert weaker.digest() != config.digest()
     assert config.digest() != run.parse(["--env", "DoraCube-v1", "--reward", "paper"]).run.digest()

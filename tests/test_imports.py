@@ -14,7 +14,8 @@ LEVELS = {
     "sim.batch": 10, "sim": 11, "sim.grasp_tests": 12,
     "tasks.mdp": 13, "tasks.guidance": 14, "tasks.env": 15, "tasks.hammer": 16, "tasks.microwave": 16,
     "tasks": 17,
-    "registration": 18, "tools": 18, "live": 18, "policies": 18.5, "integrations": 18.5, "datasets": 18.7,
+    "registration": 18, "tools": 18, "live": 18, "policies": 18.5, "integrations": 18.5,
+    "datasets": 18.7, "sweeps": 18.7,
     "commands": 19, "__main__": 20,
 }  # fmt: skip
 """A room may import itself and rooms of a lower level; a room inside one that is not listed belongs to it."""
@@ -22,7 +23,7 @@ LEARNERS = {
     "agents": 0, "agents.learners": 1, "agents.collecting": 2, "agents.evaluation": 3, "agents.runs": 4
 }  # fmt: skip
 """The same for learners, who know of the rest only what stands below level 1; policies and commands know them."""
-KNOW_LEARNERS = ("policies", "commands")
+KNOW_LEARNERS = ("policies", "sweeps", "commands")
 """Rooms that know tasks and learners."""
 FORBIDDEN = {
     "robot": ("sapien", "mani_skill", "torchrl"),

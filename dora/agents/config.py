@@ -117,6 +117,8 @@ class SACConfig:
     """Widths of the hidden layers of actor and critics."""
 
 
+NEUTRAL = {"arm_effort": 1.0}
+"""Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
 DIGITS = 12
 """Hexadecimal digits of a digest of settings."""
 LEARNER_CONFIGS: dict[str, type[PPOConfig] | type[SACConfig]] = {
@@ -187,24 +189,26 @@ class RunConfig(Generic[Numbers, Settings, Agent]):
         return options | ({"config": self.task} if self.task else {})
 
     def digest(self) -> str:
-        """Twelve hexadecimal digits that differ between settings; `total_steps` may grow and is left out, and so is the
-        dense reward, for settings of versions that had no other."""
+        """Twelve hexadecimal digits that differ between settings; `total_steps` may grow and is left out. So are the
+        dense reward and the numbers of `NEUTRAL` that change nothing, for settings of versions that had no other."""
         return digest_of(_digested(plain(self)))[:DIGITS]
 
 
 def _digested(content: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that enter a digest."""
     left_out = {"total_steps"} | ({"reward"} if content.get("reward") == "dense" else set())
-    return {name: value for name, value in content.items() if name not in left_out}
+    task = {name: value for name, value in content.get("task", {}).items() if NEUTRAL.get(name) != value}
+    return {name: value for name, value in content.items() if name not in left_out} | {"task": task}
 
 
 def stored_digests(content: Mapping[str, Any]) -> tuple[str, ...]:
-    """The digests that settings may have been stored with: that of `RunConfig.digest`, and that of the versions whose
-    `task` held only preset and parts of guidance."""
+    """The digests that settings may have been stored with: that of `RunConfig.digest`, that of versions that left no
+    number of the task out, and that of the versions whose `task` held only preset and parts of guidance."""
     settings = _digested(content)
+    whole = settings | {"task": content.get("task", {})}
     first = {name: value for name, value in settings.items() if name != "task" or value}
     text = json.dumps(first, sort_keys=True).encode()
-    return digest_of(settings)[:DIGITS], hashlib.sha256(text).hexdigest()[:DIGITS]
+    return digest_of(settings)[:DIGITS], digest_of(whole)[:DIGITS], hashlib.sha256(text).hexdigest()[:DIGITS]
 
 
 def config_from_dict(content: Any, source: str = "the settings") -> RunConfig:

@@ -10,7 +10,7 @@ import tyro
 
 from dora.agents.config import LEARNER_CONFIGS
 from dora.agents.runs.recommended import learners_of, recommended
-from dora.commands import bench, demos, grasps, play, report, run, view
+from dora.commands import bench, demos, grasps, play, report, run, sweep, view
 from dora.tasks import find_task
 from dora.tasks.env.options import task_config
 
@@ -62,6 +62,7 @@ FORMS = {
     "grasps": lambda: grasps.Args,
     "view": lambda: view.Args,
     "bench": _bench,
+    "sweep": lambda: sweep.Args,
     "report": lambda: report.Arguments,
 }
 """By command, a function that returns the type from which tyro makes its options."""

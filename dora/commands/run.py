@@ -71,6 +71,9 @@ class Args(Generic[Numbers, Settings, Agent]):
     """Evaluate the zero action, too, where it is that of a reference (default with --eval-only: no)."""
     checkpoint: Path | None = None
     """Checkpoint to evaluate: a .safetensors file, or a run folder for its best one."""
+    collector: Literal["processes", "ray"] = "processes"
+    """Where workers collect: in processes of this machine, or in actors of the Ray cluster at RAY_ADDRESS, one core
+    each (without that variable, of one on this machine alone; needs `pip install ray`)."""
     video: bool = False
     """Film a few episodes of the policy, after training or before evaluation (needs a Vulkan driver)."""
     first_seed: Annotated[int, tyro.conf.Suppress] = FINAL_SEED
@@ -183,7 +186,8 @@ def train(args: Args) -> tuple[Path, int]:
         folder.create(config)
     with folder.locked():
         folder.write_config(config)
-        trainer = Trainer(config, task_maker(config), folder, resume=args.resume is not None, zero=args.zero_correction)
+        options: Any = {"zero": args.zero_correction, "cluster": args.collector == "ray"}
+        trainer = Trainer(config, task_maker(config), folder, resume=args.resume is not None, **options)
         go_on = "To go on: " + shlex.join([*started_as(sys.orig_argv, sys.argv), "--resume", str(folder.path)])
         try:
             trainer.run()

@@ -1,4 +1,5 @@
-"""Rollouts by TorchRL collectors, in this process or in worker processes that each hold a task batch."""
+"""Rollouts by TorchRL collectors, in this process or in workers that each hold a task batch: processes of this machine,
+or actors of a Ray cluster."""
 
 import copy
 import functools
@@ -18,6 +19,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector, MultiSyncCollector
 
+from dora.agents.collecting.ray_collector import explained, ray_collector, whole_batch
 from dora.agents.collecting.task_env import Task, TaskEnv, TaskFactory
 from dora.agents.learners.networks import Policy
 from dora.errors import InputError, RunFailure, WorkerFailure
@@ -85,9 +87,10 @@ class Rollouts:
             a batch then comes from the policy as it was one call of `collect` earlier. Without workers it changes
             nothing.
         check: called now and then while workers start; may raise.
+        cluster: the workers are actors of a Ray cluster.
 
     Raises:
-        InputError: with the message of a worker that raised one.
+        InputError: with the message of a worker that raised one, or there is no cluster.
         WorkerFailure: if a worker failed otherwise or died.
     """
 
@@ -103,8 +106,10 @@ class Rollouts:
         stagger: bool,
         ahead: bool = False,
         check: Callable[[], None] = lambda: None,
+        cluster: bool = False,
     ):
         self._policy = policy
+        self._waits, self._cluster = workers > 0, cluster and workers > 0
         self._acting = copy.deepcopy(policy) if workers > 0 else policy  # the workers share its memory
         self._ahead = ahead
         self._next: Future[TensorDictBase] | None = None
@@ -112,7 +117,10 @@ class Rollouts:
         self._scratch = tempfile.TemporaryDirectory(prefix=name_of_process())
         self._reports = [Path(self._scratch.name) / str(i) for i in range(max(workers, 1))]
         self._processes: Sequence[Any] = ()
-        if workers == 0:
+        if self._cluster:
+            frames = workers * num_envs * rollout
+            self._collector: Any = ray_collector(make_task, self._acting, frames=frames, seeds=seeds, stagger=stagger)
+        elif workers == 0:
             env = TaskEnv(make_task(), seed=seeds[0], stagger=stagger)
             self._collector = Collector(
                 env,
@@ -180,7 +188,7 @@ class Rollouts:
             InputError: with the message of a worker that raised one.
             WorkerFailure: if a worker failed otherwise, died, or hangs.
         """
-        if not self._processes:
+        if not self._waits:
             return next(self._iterator)
         with self._explained():
             future = self._next or self._begin()
@@ -199,8 +207,8 @@ class Rollouts:
     def _begin(self) -> "Future[TensorDictBase]":
         """Start a batch with the present policy; a thread waits for it, which does not keep the process alive."""
         self._acting.load_state_dict(self._policy.state_dict())
-        self._collector.update_policy_weights_()
-        return _in_thread(functools.partial(next, self._iterator))
+        self._collector.update_policy_weights_(self._acting if self._cluster else None)
+        return _in_thread(lambda: whole_batch(next(self._iterator)))
 
     def close(self, at_once: bool = False) -> None:
         """End the workers; `at_once` without waiting for what they are doing."""
@@ -208,7 +216,10 @@ class Rollouts:
             _kill(self._processes)
         if self._next is not None:
             wait([self._next], SHUTDOWN_SECONDS)  # the batch that is under way
-        self._collector.shutdown(timeout=SHUTDOWN_SECONDS, raise_on_error=not at_once)
+        if self._cluster:
+            self._collector.shutdown(timeout=SHUTDOWN_SECONDS)
+        else:
+            self._collector.shutdown(timeout=SHUTDOWN_SECONDS, raise_on_error=not at_once)
         self._scratch.cleanup()
 
     def __enter__(self) -> "Rollouts":
@@ -225,6 +236,8 @@ class Rollouts:
         except (RunFailure, InputError):
             raise
         except Exception as error:
+            if (failure := explained(error)) is not None:
+                raise failure from error
             for index, report in enumerate(self._reports):
                 if report.exists():
                     kind, _, message = report.read_text().partition("\n")

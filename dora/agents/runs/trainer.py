@@ -87,15 +87,23 @@ class Trainer:
         folder: an existing run folder.
         resume: go on from the folder's latest checkpoint, or begin if there is none yet.
         zero: evaluate zero correction at the end, too, if there is a prior.
+        cluster: workers are actors of a Ray cluster instead of processes of this machine.
 
     Raises:
         InputError: if the checkpoint does not fit.
     """
 
     def __init__(
-        self, config: RunConfig, make_task: MakeTask, folder: RunFolder, *, resume: bool = False, zero: bool = True
+        self,
+        config: RunConfig,
+        make_task: MakeTask,
+        folder: RunFolder,
+        *,
+        resume: bool = False,
+        zero: bool = True,
+        cluster: bool = False,
     ):
-        self.config, self.make_task, self.folder, self._zero = config, make_task, folder, zero
+        self.config, self.make_task, self.folder, self._zero, self._cluster = config, make_task, folder, zero, cluster
         torch.set_num_threads(config.learner_threads)
         os.environ[RECORDS] = str(folder.nonfinite.absolute())  # processes that are started later see it, too
         self.interrupted: int | None = None
@@ -190,6 +198,7 @@ class Trainer:
             stagger=config.stagger,
             ahead=self.learner.replay is not None,
             check=interrupt.check,
+            cluster=self._cluster,
         )
         if self._resumed is not None:
             with whole(self.folder.latest):

@@ -1,0 +1,159 @@
+"""The loop of a sweep: begins runs while there is room, repeats those that fail, and says how it stands."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+
+from dora.sweeps.finished import Finished, finished_runs, result_of, seconds_per_step
+from dora.sweeps.launching import Launcher, is_finished, is_locked, prepare, progress_of
+from dora.sweeps.plan import Row
+
+POLL_SECONDS = 1.0
+"""Time between two looks at the runs [s]."""
+
+
+class State(Enum):
+    """How a run of a sweep stands."""
+
+    WAITING = "waiting"
+    RUNNING = "running"
+    ELSEWHERE = "running (another process)"
+    DONE = "done"
+    FAILED = "failed"
+
+
+@dataclass
+class Entry:
+    """A run of a sweep and how it stands.
+
+    Attributes:
+        row: the run.
+        folder: in which it is trained, or that holds its result.
+        state: how it stands.
+        rate: time for an environment step that is expected [s].
+        tries: how often it was begun or gone on with.
+        complaint: what went wrong last.
+        success_rate: of a finished run.
+        seconds: wall time of a finished run [s].
+    """
+
+    row: Row
+    folder: Path
+    state: State = State.WAITING
+    rate: float = 0.0
+    tries: int = 0
+    complaint: str = ""
+    success_rate: float | None = None
+    seconds: float | None = None
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps that were taken."""
+        return self.row.config.total_steps if self.state is State.DONE else progress_of(self.folder)[0]
+
+    @property
+    def seconds_left(self) -> float:
+        """Time that the rest is expected to take alone on the machine [s]."""
+        if self.state in (State.DONE, State.FAILED):
+            return 0.0
+        return max(self.row.config.total_steps - self.env_steps, 0) * self.rate
+
+
+@dataclass
+class Sweep:
+    """The runs of a sweep.
+
+    Attributes:
+        entries: the runs, in their order.
+        out: folder of the sweep.
+        known: folders whose finished runs count, besides `out`.
+        jobs: runs at the same time.
+        retries: how often a run is gone on with after it failed.
+    """
+
+    rows: Sequence[Row]
+    out: Path
+    known: Sequence[Path] = ()
+    jobs: int = 1
+    retries: int = 1
+    entries: list[Entry] = field(init=False)
+
+    def __post_init__(self) -> None:
+        found = self._found()
+        self.entries = [Entry(row, self.out / row.name, rate=seconds_per_step(row, found)) for row in self.rows]
+        for entry in self.entries:
+            self._settle(entry, found)
+
+    def _found(self) -> list[Finished]:
+        return finished_runs(folder for folder in (self.out, *self.known) if folder.is_dir())
+
+    @property
+    def seconds_left(self) -> float:
+        """Time until all runs are finished, as far as known [s]."""
+        longest = max((entry.seconds_left for entry in self.entries), default=0.0)
+        return max(sum(entry.seconds_left for entry in self.entries) / max(self.jobs, 1), longest)
+
+    def count(self, state: State) -> int:
+        """Number of runs that stand so."""
+        return sum(entry.state is state for entry in self.entries)
+
+    def run(self, launcher: Launcher, tell: Callable[["Sweep"], None], check: Callable[[], None]) -> None:
+        """Train until every run is finished or has failed too often.
+
+        Args:
+            launcher: trains them.
+            tell: called in every turn, to show how it stands.
+            check: called in every turn; what it raises ends the sweep, when the runs have saved their states.
+
+        Raises:
+            InputError: the folder of a run cannot be used.
+        """
+        try:
+            while self.count(State.DONE) + self.count(State.FAILED) < len(self.entries):
+                check()
+                for row, complaint in launcher.ended():
+                    self._note_end(row, complaint)
+                self._look_elsewhere()
+                self._begin(launcher)
+                tell(self)
+                time.sleep(POLL_SECONDS)
+        finally:
+            launcher.stop()
+        tell(self)
+
+    def _note_end(self, row: Row, complaint: str | None) -> None:
+        entry = next(entry for entry in self.entries if entry.row is row)
+        if complaint is None:
+            self._settle(entry, self._found())
+            return
+        entry.complaint = complaint
+        entry.state = State.WAITING if entry.tries <= self.retries else State.FAILED
+
+    def _look_elsewhere(self) -> None:
+        """Notes which runs another process trains, such as one of a sweep that was killed, and which have ended."""
+        for entry in self.entries:
+            if entry.state in (State.WAITING, State.ELSEWHERE):
+                locked = is_locked(entry.folder)
+                if not locked and is_finished(entry.folder):
+                    self._settle(entry, self._found())
+                else:
+                    entry.state = State.ELSEWHERE if locked else State.WAITING
+
+    def _begin(self, launcher: Launcher) -> None:
+        """Begins as many runs as there is room for."""
+        for entry in self.entries:
+            if self.count(State.RUNNING) + self.count(State.ELSEWHERE) >= self.jobs:
+                return
+            if entry.state is State.WAITING:
+                prepare(entry.row, entry.folder)
+                entry.state, entry.tries = State.RUNNING, entry.tries + 1
+                launcher.start(entry.row, entry.folder)
+
+    def _settle(self, entry: Entry, found: Sequence[Finished]) -> None:
+        """Notes the result of a run, if there is one."""
+        one = result_of(entry.row, found)
+        if one is not None:
+            entry.state, entry.folder = State.DONE, one.folder
+            entry.success_rate, entry.seconds = one.success_rate, one.seconds
