@@ -80,6 +80,24 @@ def test_runs_of_tasks_with_other_numbers_are_not_averaged(tmp_path: Path):
     ]  # fmt: skip
 
 
+def test_numbers_that_earlier_versions_lacked_make_no_rows_where_they_change_nothing(tmp_path: Path):
+    for seed, each in enumerate([{"lift": 0.1}, {"lift": 0.1, "arm_effort": 1.0}, {"lift": 0.1, "arm_effort": 0.5}]):
+        write_run(tmp_path / str(seed), seed, 0.5)
+        path = tmp_path / str(seed) / "result.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"task_config": each}))
+    rows = tables(find_runs(tmp_path)).splitlines()[2:]
+    assert sorted(row.split(" | ")[4] for row in rows) == ["1", "2"]
+
+
+@pytest.mark.parametrize(("loads", "mark"), [([0.0, 0.1], ""), ([0.05, 0.4], " †"), ([0.0, None], " ?")])
+def test_minutes_beside_other_programs_are_marked(tmp_path: Path, loads: list[float | None], mark: str):
+    for seed, load in enumerate(loads):
+        write_run(tmp_path / str(seed), seed, 0.5)
+        path = tmp_path / str(seed) / "result.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"other_load": load}))
+    assert tables(find_runs(tmp_path)).splitlines()[2].endswith(f"| 1.5 ± 0.0{mark} |")
+
+
 def test_success_has_the_interval_of_all_episodes_and_zero_correction_that_of_each_start_once(tmp_path: Path):
     write_run(tmp_path / "a", 0, 0.9, episodes=200)
     write_run(tmp_path / "b", 1, 1.0, episodes=200)

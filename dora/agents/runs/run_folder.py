@@ -205,9 +205,11 @@ def make_result(
     curve: list[list[Any]],
     finished: bool,
     nonfinite: int = 0,
+    other_seconds: float | None = None,
 ) -> dict[str, Any]:
     """Content of `result.json`; rates are null where nothing was evaluated. `curve` has the rows of `curve.csv`,
-    `nonfinite` is the number of training episodes whose simulation was not finite."""
+    `nonfinite` is the number of training episodes whose simulation was not finite, `other_seconds` the processor time
+    that other programs took meanwhile [s], None where it is not known."""
     rate = env_steps / wall_seconds if wall_seconds > 0 else 0.0
     some = evaluation
     return {
@@ -244,6 +246,7 @@ def make_result(
         "reward": config.reward,
         "total_steps": config.total_steps,
         "first_seed": some.first_seed if some else None,
+        "other_load": other_seconds / wall_seconds if other_seconds is not None and wall_seconds > 0 else None,
     }
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from dora.agents.config import NEUTRAL
 from dora.agents.evaluation.evaluate import FINAL_SEED
 from dora.agents.runs.progress_table import read_progress
 from dora.agents.runs.stored_results import read_curve, read_result
@@ -82,7 +83,7 @@ def grouped(runs: Sequence[Run]) -> dict[Group, list[Run]]:
 
 def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Runs by what the numbers of their task differ in, in words: by switches alone where these tell them apart."""
-    numbers = [dict(_flat(run.result.get("task_config") or {})) for run in runs]
+    numbers = [dict(_flat(NEUTRAL | (run.result.get("task_config") or {}))) for run in runs]
     names = sorted({name for each in numbers for name in each})
     different = [name for name in names if len({str(each.get(name)) for each in numbers}) > 1]
     switches = [name for name in different if isinstance(numbers[0].get(name), bool | str)]

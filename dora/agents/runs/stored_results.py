@@ -26,6 +26,7 @@ REQUIRED = {
 OPTIONAL = {
     "preset": "text", "guidance_parts": "texts or none", "reward": "text", "checkpoint": "text or none",
     "eval_episodes": "count", "total_steps": "count", "first_seed": "count or none", "task": "mapping",
+    "other_load": "number or none",
 }  # fmt: skip
 """The same of entries that results of some versions have."""
 NESTED = {"preset": "text", "guidance_parts": "texts or none"}

@@ -38,6 +38,7 @@ from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.configs import built
 from dora.errors import RECORDS, WorkerFailure
+from dora.machine import OtherLoad
 from dora.progress import ProgressDisplay
 
 TRAINING_SEEDS = 1_000_000_000
@@ -75,6 +76,8 @@ class Counters:
     nonfinite: int = 0
     """Episodes that ended because their simulation was not finite."""
     curve: list[list[Any]] = field(default_factory=list)
+    other_seconds: float = 0.0
+    """Processor time that other programs took meanwhile [s]."""
     seconds: dict[str, float] = field(default_factory=lambda: {"collect": 0.0, "learn": 0.0, "evaluate": 0.0})
 
 
@@ -132,6 +135,7 @@ class Trainer:
                 case the state is saved; `result.json` has `finished` false.
         """
         evaluation, zero, finished = None, None, False
+        self._others = OtherLoad()
         with Interrupt() as interrupt:
             self.folder.mark_unfinished()
             log = RunLog(self.folder.path, self.counters.env_steps, self.config)
@@ -180,6 +184,7 @@ class Trainer:
             curve=counters.curve,
             finished=finished,
             nonfinite=counters.nonfinite,
+            other_seconds=counters.other_seconds,
         )
         if evaluation is not None:
             self.folder.write_evaluation(evaluation)
@@ -255,6 +260,8 @@ class Trainer:
     def _spend(self, what: str, seconds: float) -> None:
         self.counters.seconds[what] += seconds
         self.counters.wall_seconds += seconds
+        if what != "collect":  # looking takes milliseconds
+            self.counters.other_seconds += self._others.seconds()
 
     def _training_success(self) -> float | None:
         if len(self._recent) == 0:

@@ -1,0 +1,45 @@
+"""How busy other programs keep the machine, told apart from this one and what it has started."""
+
+import subprocess
+import sys
+import time
+from typing import Any
+
+import psutil
+
+from dora.machine import OtherLoad, own_seconds
+
+SPIN = "import time; end = time.process_time() + {}\nwhile time.process_time() < end: pass"
+"""Program that takes so much processor time [s]."""
+TICK = 0.1
+"""Processor times are known to some ticks of the system [s]."""
+
+
+def test_own_work_and_that_of_children_is_own():
+    before = own_seconds()
+    subprocess.run([sys.executable, "-c", SPIN.format(0.5)], check=True)
+    after = own_seconds()
+    assert after - before >= 0.5 - TICK
+    exec(SPIN.format(0.3))
+    assert own_seconds() - after >= 0.3 - TICK
+
+
+def test_work_of_a_child_that_goes_on_is_own():
+    before = own_seconds()
+    with subprocess.Popen([sys.executable, "-c", SPIN.format(60)]) as child:
+        process: Any = psutil.Process(child.pid)
+        while process.cpu_times().user < 0.4:
+            time.sleep(0.05)
+        assert own_seconds() - before >= 0.4 - TICK
+        child.kill()
+
+
+def test_work_of_others_is_not():
+    load = OtherLoad()
+    # The shell ends at once, so that the program is nobody's child.
+    program = f'"{sys.executable}" -c "{SPIN.format(1.0)}" & echo $!'
+    pid = int(subprocess.run(["sh", "-c", program], capture_output=True, text=True, check=True).stdout)
+    while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+        time.sleep(0.05)
+    assert load.seconds() >= 1.0 - TICK
+    assert load.seconds() >= 0.0
