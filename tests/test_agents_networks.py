@@ -5,8 +5,10 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from dora.agents.config import PPOConfig, SACConfig
 from dora.agents.learners.networks import GaussianActor, Normaliser, Policy, TanhActor
-from dora.agents.learners.ppo import advantages
+from dora.agents.learners.ppo import PPO, advantages
+from dora.agents.learners.sac import SAC
 
 
 def test_normaliser_agrees_with_numpy():
@@ -68,6 +70,14 @@ def test_correlated_noise_has_unit_variance_and_the_asked_correlation():
     noise = noise - noise.mean()
     assert abs(noise.var() - 1) < 0.05
     assert abs((noise[1:] * noise[:-1]).mean() / noise.var() - 0.8) < 0.02
+
+
+def test_only_critics_that_bootstrap_from_themselves_are_normalised():
+    """Layer normalisation keeps SAC's targets from running away; PPO's are returns (docs/agents.md)."""
+    ppo, sac = PPO(PPOConfig(), 4, 2, 1000), SAC(SACConfig(), 4, 2, 1000)
+    linear, normalised = 2 * 3, 2 * 3 + 2 * 2  # weights and biases of three layers, and of two that normalise
+    assert len(list(ppo.critic.parameters())) == linear
+    assert len(sac.critic_parameters) == normalised
 
 
 def test_truncation_bootstraps_from_the_last_observation_and_termination_does_not():

@@ -163,6 +163,13 @@ class Slow(PointMass):
         return super().step(action)
 
 
+def test_the_rate_that_is_shown_is_steps_over_time(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    run(tmp_path / "run", dataclasses.replace(BASE, total_steps=2_000))
+    shown = [float(rate.replace(",", "")) for rate in re.findall(r"([\d,]+) steps/s", capfd.readouterr().err)]
+    assert shown
+    assert all(0 < rate < 1e8 for rate in shown)
+
+
 @pytest.mark.slow
 def test_batches_collected_ahead_are_of_the_policy_before():
     learner = PPO(dataclasses.replace(SMALL_PPO, log_std=-3.0), 4, 2, 1000)

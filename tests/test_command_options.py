@@ -1,5 +1,6 @@
 """Options out of range are refused in one sentence before any work, by every command."""
 
+import dataclasses
 import re
 import shutil
 import sys
@@ -9,6 +10,8 @@ import gymnasium as gym
 import pytest
 from commands import call, load_command
 
+from dora.agents.config import PPOConfig, RunConfig
+from dora.agents.limits import MOST_TRANSITIONS, check
 from dora.errors import InputError
 from dora.tools.demonstrations import record_demonstrations
 
@@ -62,6 +65,13 @@ def test_every_number_of_a_run_has_a_range():
     }
     for cls in LEARNER_CONFIGS.values():
         assert {n for n, v in vars(cls()).items() if type(v) in (int, float)} <= set(LEARNER)
+
+
+def test_as_many_transitions_as_are_allowed_are():
+    most = RunConfig("x", "ppo", num_envs=1000, workers=0, learner=PPOConfig(rollout=MOST_TRANSITIONS // 1000))
+    check(most)
+    with pytest.raises(InputError, match="transitions at once"):
+        check(dataclasses.replace(most, num_envs=1001))
 
 
 def test_transitions_of_an_iteration_are_bounded():

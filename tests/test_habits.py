@@ -223,6 +223,17 @@ def test_one_environment_on_maniskills_own_back_end_begins_in_a_state_too():
         env.close()
 
 
+def test_a_state_that_is_set_after_a_reset_waits_for_no_reset(env: Any):
+    """Only within a reset does ManiSkill reset controllers after it has restored a state."""
+    if base(env).spec.id == STOCK:
+        pytest.skip("has no controllers of ours")
+    moved(env, 3)
+    assert not base(env).resetting
+    with pytest.raises(InputError):
+        env.reset(seed="no number")
+    assert not base(env).resetting
+
+
 @pytest.mark.parametrize(("rows", "cached"), [([3, 1], True), (np.array([False, True, False, True]), False)])
 def test_some_begin_in_given_states_and_the_others_go_on_bit_for_bit(env: Any, other: Any, rows: Any, cached: bool):
     obs = moved(env, 3)

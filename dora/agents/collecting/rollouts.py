@@ -210,7 +210,7 @@ class Rollouts:
         self._collector.update_policy_weights_(self._acting if self._cluster else None)
         return _in_thread(lambda: whole_batch(next(self._iterator)))
 
-    def close(self, at_once: bool = False) -> None:
+    def close(self, at_once: bool) -> None:
         """End the workers; `at_once` without waiting for what they are doing."""
         if at_once:
             _kill(self._processes)
