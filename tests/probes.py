@@ -31,10 +31,10 @@ from dora.agents.config import RunConfig, SACConfig
 from dora.agents.evaluation.play import load_policy
 from dora.agents.learners.learner import make_learner
 from dora.agents.learners.replay import Replay
+from dora.agents.reports.report import tables, write_report
+from dora.agents.reports.run_results import find_runs
 from dora.agents.runs.progress_table import ProgressTable
-from dora.agents.runs.report import tables, write_report
 from dora.agents.runs.run_folder import RunFolder
-from dora.agents.runs.run_results import find_runs
 from dora.live.recordings import Recording
 from dora.robot import loading
 from dora.robot.build import write_urdf
@@ -139,10 +139,14 @@ def write_result(folder: Path) -> None:
         "env": "Toy-v1", "agent": "ppo", "guidance": "affordance", "seed": 0, "env_steps": 1000, "wall_seconds": 90.0,
         "success_rate": 0.5, "zero_success_rate": 0.5, "penetration_p95_mm": 2.0, "finished": True,
         "eval_episodes": 200, "total_steps": 1000, "first_seed": 5, "preset": "standard", "guidance_parts": ["prior"],
+        "raw_success_rate": 0.5, "steps_to_80": None, "stage_rates": {"reach": 0.75},
     }  # fmt: skip
     (folder / "result.json").write_text(json.dumps(result))
     head = "env_steps,wall_seconds,success_rate,return_mean,penetration_p95_mm,training_success_rate"
     (folder / "curve.csv").write_text(f"{head}\n500,45,0.1,3,2,0.1\n1000,90,0.5,9,nan,0.4\n")
+    for name in ("eval.csv", "zero.csv"):
+        rows = [f"{k},{k % 2},{k % 2},{k / 100}\n" for k in range(20)]
+        (folder / name).write_text("".join(["episode,success,stage/reach,penetration_mm\n", *rows]))
     table = ProgressTable(folder / "progress.csv", ["reach"])
     for step in range(100, 1100, 100):
         table.add({"env_steps": step, "seconds": step / 10, "episodes": 3, "success_rate": 0.5, "return_mean": 1.0})
@@ -264,6 +268,7 @@ LOADERS: dict[str, Loader] = {
     "result.json": Loader(write_result, load_results, ("result.json",)),
     "curve.csv": Loader(write_result, load_results, ("curve.csv",)),
     "progress.csv": Loader(write_result, load_results, ("progress.csv",)),
+    "eval.csv": Loader(write_result, load_report, ("eval.csv", "zero.csv")),
     "recording": Loader(write_recording, load_recording),
     "report": Loader(write_result, load_report),
     "robot.toml": Loader(write_robot, load_robot, ("robot.toml",)),

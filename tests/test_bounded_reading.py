@@ -20,7 +20,7 @@ from dora.affordance.objects.importing import read_mesh
 from dora.affordance.objects.labels import read_labels
 from dora.affordance.views.page import describe
 from dora.affordance.views.server import start_server
-from dora.agents.runs.report import write_report
+from dora.agents.reports.report import write_report
 from dora.agents.runs.run_folder import RunFolder
 from dora.files import read_tensors
 from dora.reading import read_array, read_toml, read_xml, read_yaml
@@ -186,6 +186,10 @@ def test_xml_that_is_small_is_read(tmp_path: Path):
         ("curve.csv", f"{CURVE}\n1,1,0,0\n", "line 2 has 4 cells"),
         ("curve.csv", f"{CURVE}\nnan,1,0,0,0\n", "out of range"),
         ("curve.csv", f"{CURVE}\n1,1,inf,0,0\n", "out of range"),
+        ("eval.csv", "episode,success\n" + "1,1\n" * 20_001, "rows"),
+        ("eval.csv", "episode,success\n1,0.5\n", "success is not 0 or 1"),
+        ("zero.csv", "episode,success\n1,nan\n", "success is not 0 or 1"),
+        ("zero.csv", "episode,win\n1,1\n", "lacks a column"),
         ("progress.csv", "x\n" * 300_000, "lacks a column|more than a report reads"),
         ("progress.csv", "", "lacks a column"),
     ],
@@ -209,6 +213,11 @@ def test_tables_of_runs(tmp_path: Path, table: str, content: str, words: str):
         ("success_rate", None),
         ("success_rate", 2),
         ("first_seed", [1]),
+        ("stage_rates", {"reach": 2}),
+        ("stage_rates", [0.5]),
+        ("steps_to_80", 0.5),
+        ("raw_success_rate", "all"),
+        ("other_load", float("inf")),
         ("task", {"guidance_parts": "abc"}),
         ("task", 1),
     ],
@@ -225,7 +234,8 @@ def test_names_from_files_are_text_in_figures_and_on_pages(tmp_path: Path):
     result = json.loads((tmp_path / "result.json").read_text())
     name = "$\\frac{$_<b>[x](y)"
     written(tmp_path / "result.json", json.dumps(result | {"env": name, "guidance": "$x_{$"}))
-    table, page, _ = write_report(tmp_path, tmp_path / "out")
+    table, compared, page, *_ = write_report(tmp_path, tmp_path / "out")
+    assert "<b>" not in compared.read_text()
     assert "<b>" not in table.read_text() + page.read_text()
     assert "[x](y)" not in table.read_text()
     assert markdown_text("a\n*b* <i>") == "a \\*b\\* &lt;i&gt;"

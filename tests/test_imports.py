@@ -7,7 +7,7 @@ import pytest
 
 LEVELS = {
     "errors": 0, "version": 0, "quiet_start": 0, "reading": 0.4, "arguments": 0.5, "configs": 0.5, "containers": 0.5,
-    "digests": 0.5, "files": 0.5, "machine": 0.5, "parallel": 0.5, "progress": 0.5, "tables": 0.5,
+    "digests": 0.5, "files": 0.5, "parallel": 0.5, "progress": 0.5, "tables": 0.5,
     "geometry": 1, "robot": 2, "robot.motion": 3,
     "affordance.objects": 4, "affordance.hand": 5, "affordance.maps": 6, "affordance": 7, "affordance.search": 8,
     "affordance.reach": 8, "affordance.views": 9,
@@ -20,7 +20,8 @@ LEVELS = {
 }  # fmt: skip
 """A room may import itself and rooms of a lower level; a room inside one that is not listed belongs to it."""
 LEARNERS = {
-    "agents": 0, "agents.learners": 1, "agents.collecting": 2, "agents.evaluation": 3, "agents.runs": 4
+    "agents": 0, "agents.learners": 1, "agents.collecting": 2, "agents.evaluation": 3, "agents.runs": 4,
+    "agents.reports": 5,
 }  # fmt: skip
 """The same for learners, who know of the rest only what stands below level 1; policies and commands know them."""
 KNOW_LEARNERS = ("policies", "sweeps", "commands")

@@ -7,7 +7,7 @@ from typing import Any
 
 import psutil
 
-from dora.machine import OtherLoad, own_seconds
+from dora.agents.runs.machine import OtherLoad, own_seconds
 
 SPIN = "import time; end = time.process_time() + {}\nwhile time.process_time() < end: pass"
 """Program that takes so much processor time [s]."""

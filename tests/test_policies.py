@@ -17,7 +17,7 @@ from dora.agents.checkpoint import read_checkpoint
 from dora.agents.collecting.task_env import EpisodeColumns
 from dora.agents.evaluation.evaluate import Evaluation
 from dora.agents.evaluation.intervals import wilson
-from dora.agents.runs.run_results import find_runs
+from dora.agents.reports.run_results import find_runs
 from dora.errors import InputError
 from dora.policies import bundle
 from dora.policies.bundle import PAGE, cards_table, check_agrees, chosen, is_bundled, make_card

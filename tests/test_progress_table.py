@@ -9,7 +9,7 @@ import pytest
 from fake_task import PointMass
 
 from dora.agents.config import PPOConfig, RunConfig
-from dora.agents.runs.figures import smoothed
+from dora.agents.reports.figures import smoothed
 from dora.agents.runs.progress_table import COLUMNS, ProgressTable, read_progress
 from dora.agents.runs.run_folder import RunFolder, steps_to
 from dora.agents.runs.trainer import Trainer

@@ -4,14 +4,13 @@ import dataclasses
 import json
 import re
 from pathlib import Path
-from urllib.parse import unquote
 
 import imageio.v2 as imageio
 import pytest
 
+from dora.agents.reports.report import pooled, tables, write_report
+from dora.agents.reports.run_results import find_runs, zero_shares
 from dora.agents.runs.progress_table import ProgressTable
-from dora.agents.runs.report import pooled, tables, write_report
-from dora.agents.runs.run_results import find_runs, zero_shares
 from dora.errors import InputError
 
 
@@ -140,7 +139,7 @@ def test_a_report_has_a_table_a_page_and_a_figure(tmp_path: Path):
     write_run(tmp_path / "runs" / "b", 0, 0.5, preset="hard")
     write_run(tmp_path / "runs" / "c", 0, 0.1, guidance="none")
     paths = write_report(tmp_path / "runs", tmp_path / "out")
-    assert {p.name for p in paths} == {"tables.md", "report.html", "Toy-v1.png", "Toy-v1-hard.png"}
+    assert {p.name for p in paths} == {"tables.md", "comparison.md", "report.html", "Toy-v1.png", "Toy-v1-hard.png"}
     assert all(p.stat().st_size > 100 for p in paths)
     assert "Toy-v1.png" in (tmp_path / "out" / "report.html").read_text()
 
@@ -148,14 +147,14 @@ def test_a_report_has_a_table_a_page_and_a_figure(tmp_path: Path):
 def test_names_from_files_are_text_in_a_report(tmp_path: Path):
     name = '<script>alert("$1|2")</script>'
     write_run(tmp_path / "runs" / "a", 0, 0.9, env=name)
-    table, page, figure = write_report(tmp_path / "runs", tmp_path / "out")
+    table, _, page, figure = write_report(tmp_path / "runs", tmp_path / "out")
     for text in (table.read_text(), page.read_text()):
         assert "<script" not in text
         assert "&lt;script&gt;alert" in text
     assert "1\\|2" in table.read_text()
     assert figure.parent == tmp_path / "out"
-    [source] = re.findall('src="(.*?)"', page.read_text())
-    assert unquote(source) == figure.name
+    [shown] = re.findall('<img alt="(.*?)" src="data:', page.read_text())
+    assert shown == figure.name
 
 
 def test_no_runs_and_damaged_ones_are_refused(tmp_path: Path):

@@ -182,7 +182,7 @@ def test_a_batch_equals_singles(env_id: str):
         torch.testing.assert_close(alone[:, 0], together[:, i], atol=2e-3, rtol=0)
 
 
-@pytest.mark.parametrize("env_id", slow_for("DoraMicrowave-v1"))
+@pytest.mark.parametrize("env_id", slow_for("DoraHammer-v1", "DoraMicrowave-v1"))
 def test_the_script_visits_every_stage_in_order_and_succeeds(env_id: str, guidance: str):
     task = tasks.make_task(env_id, 16, guidance=guidance, preset="none")
     task.reset(seed=5)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from dora.agents.runs.report import write_report
+from dora.agents.reports.report import write_report
 from dora.errors import command
 
 

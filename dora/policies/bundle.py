@@ -20,7 +20,7 @@ from dora.agents.config import RunConfig
 from dora.agents.evaluation.evaluate import FINAL_SEED, Evaluation
 from dora.agents.evaluation.intervals import wilson
 from dora.agents.evaluation.play import evaluate_checkpoint
-from dora.agents.runs.run_results import DEFAULT_PRESET, Run, find_runs
+from dora.agents.reports.run_results import DEFAULT_PRESET, Run, find_runs
 from dora.configs import plain
 from dora.errors import InputError, command
 from dora.files import make_folder, write_bytes

@@ -47,8 +47,8 @@ class RunFolder:
 
     `config.yaml`, `versions.txt`, TensorBoard events, `checkpoints/{latest,best}.safetensors`,
     `checkpoints/replay/` (SAC), `progress.csv` (one row per iteration), `curve.csv` (one row per evaluation),
-    `eval.csv` (one row per episode of the last evaluation), `result.json`, `video/`, `nonfinite/` (last states of
-    simulations that were not finite), `.lock`.
+    `eval.csv` (one row per episode of the last evaluation), `zero.csv` (the same of zero correction), `result.json`,
+    `video/`, `nonfinite/` (last states of simulations that were not finite), `.lock`.
     """
 
     path: Path
@@ -185,9 +185,11 @@ class RunFolder:
         """Write `curve.csv`."""
         write_csv(self.path / "curve.csv", CURVE_HEADER, rows)
 
-    def write_evaluation(self, evaluation: Evaluation) -> None:
-        """Write `eval.csv`."""
+    def write_evaluation(self, evaluation: Evaluation, zero: Evaluation | None = None) -> None:
+        """Write `eval.csv` and, of zero correction, `zero.csv`."""
         write_csv(self.path / "eval.csv", *evaluation.rows())
+        if zero is not None:
+            write_csv(self.path / "zero.csv", *zero.rows())
 
     def write_result(self, result: dict[str, Any]) -> None:
         """Write `result.json`."""

@@ -10,14 +10,16 @@ from dora.reading import read_json, read_text
 
 MOST_RESULT, MOST_TABLE = 1_000_000, 16_000_000
 """Size of a result.json and of a table above which it is not read [bytes]."""
-MOST_ROWS, MOST_CURVE = 200_000, 20_000
-"""Largest number of rows of a progress.csv and of a curve.csv [1]."""
+MOST_ROWS, MOST_CURVE, MOST_EPISODES = 200_000, 20_000, 20_000
+"""Largest number of rows of a progress.csv, of a curve.csv, and of an eval.csv [1]."""
 MOST_COLUMNS, LONGEST_NAME = 1000, 200
 """Largest number of columns of a table, and of characters of a text [1]."""
 LARGEST = 1e12
 """Every number is smaller."""
 CURVE_COLUMNS = ("env_steps", "wall_seconds", "success_rate", "return_mean", "penetration_p95_mm")
 """Columns of a learning curve that a report reads."""
+EPISODE_COLUMNS = ("episode", "success")
+"""Columns that an eval.csv has at least."""
 REQUIRED = {
     "env": "text", "agent": "text", "guidance": "text", "env_steps": "count", "wall_seconds": "number",
     "success_rate": "share", "zero_success_rate": "share or none", "penetration_p95_mm": "number or none",
@@ -26,14 +28,16 @@ REQUIRED = {
 OPTIONAL = {
     "preset": "text", "guidance_parts": "texts or none", "reward": "text", "checkpoint": "text or none",
     "eval_episodes": "count", "total_steps": "count", "first_seed": "count or none", "task": "mapping",
-    "other_load": "number or none",
+    "other_load": "number or none", "raw_success_rate": "share or none", "steps_to_80": "count or none",
+    "stage_rates": "shares",
 }  # fmt: skip
 """The same of entries that results of some versions have."""
 NESTED = {"preset": "text", "guidance_parts": "texts or none"}
 """The same of entries of `task`, where the first version put them."""
 WORDS = {
     "text": f"a text of 1 to {LONGEST_NAME} characters", "texts": "a list of texts", "mapping": "a mapping",
-    "share": "a number from 0 to 1", "count": "a whole number of at least 0", "number": f"a number below {LARGEST:g}",
+    "shares": "a mapping of names to numbers from 0 to 1", "share": "a number from 0 to 1",
+    "count": "a whole number of at least 0", "number": f"a number below {LARGEST:g}",
 }  # fmt: skip
 """How messages say what an entry has to be."""
 
@@ -44,6 +48,11 @@ def _fits(value: Any, kind: str) -> bool:
         "text": lambda: isinstance(value, str) and 0 < len(value) <= LONGEST_NAME,
         "texts": lambda: isinstance(value, list) and len(value) < MOST_COLUMNS and all(_fits(v, "text") for v in value),
         "mapping": lambda: isinstance(value, dict),
+        "shares": lambda: (
+            isinstance(value, dict)
+            and len(value) < MOST_COLUMNS
+            and all(_fits(name, "text") and _fits(share, "share") for name, share in value.items())
+        ),
         "share": lambda: number and 0 <= value <= 1,
         "count": lambda: number and isinstance(value, int) and value >= 0,
         "number": lambda: number,
@@ -94,25 +103,53 @@ def read_curve(path: Path) -> list[dict[str, float]]:
     Raises:
         InputError: it is too large, no table, or lacks a column or has a cell that is no number.
     """
-    text = read_text(path, "curve.csv", MOST_TABLE)
-    rows = []
+    columns = _read_table(path, CURVE_COLUMNS, MOST_CURVE)
+    rows: list[dict[str, float]] = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    for line, row in enumerate(rows, 2):
+        if not (row["env_steps"] >= 0 and row["wall_seconds"] >= 0):
+            raise _damaged(path, f"line {line} has steps or seconds out of range")
+    return rows
+
+
+def read_episodes(path: Path) -> dict[str, list[float]]:
+    """Columns of an eval.csv or a zero.csv, a value for each episode.
+
+    Raises:
+        InputError: it is too large, no table, lacks a column, or has a cell that is no number or a success but 0 or 1.
+    """
+    columns = _read_table(path, EPISODE_COLUMNS, MOST_EPISODES, all_columns=True)
+    if not all(value in (0.0, 1.0) for value in columns["success"]):
+        raise _damaged(path, "success is not 0 or 1 everywhere")
+    return columns
+
+
+def _damaged(path: Path, reason: object) -> InputError:
+    return InputError(f"{path} is damaged ({reason}); remove it, or repeat the run.")
+
+
+def _read_table(path: Path, needed: tuple[str, ...], most: int, all_columns: bool = False) -> dict[str, list[float]]:
+    """Columns of a table of numbers by name: those that are needed, or all.
+
+    Raises:
+        InputError: as of `read_curve`.
+    """
+    text = read_text(path, path.name, MOST_TABLE)
     try:
         lines = csv.reader(io.StringIO(text), strict=True)
         header = next(lines, [])
-        if len(header) > MOST_COLUMNS or len(set(header)) < len(header) or not set(CURVE_COLUMNS) <= set(header):
+        if len(header) > MOST_COLUMNS or len(set(header)) < len(header) or not set(needed) <= set(header):
             raise ValueError("it lacks a column, or has one twice")
-        at = [header.index(name) for name in CURVE_COLUMNS]
-        for line in lines:
+        names = tuple(header) if all_columns else needed
+        at, columns = [header.index(name) for name in names], {name: list[float]() for name in names}
+        for count, line in enumerate(lines, 1):
             if len(line) != len(header):
                 raise ValueError(f"line {lines.line_num} has {len(line)} cells and not {len(header)}")
-            row = dict(zip(CURVE_COLUMNS, (float(line[k]) for k in at), strict=True))
-            if not (0 <= row["env_steps"] < LARGEST and 0 <= row["wall_seconds"] < LARGEST):
-                raise ValueError(f"line {lines.line_num} has steps or seconds out of range")
-            if any(abs(value) >= LARGEST for value in row.values()):
-                raise ValueError(f"line {lines.line_num} has a number out of range")
-            rows.append(row)
-            if len(rows) > MOST_CURVE:
-                raise ValueError(f"it has more than {MOST_CURVE} rows")
+            for name, k in zip(names, at, strict=True):
+                columns[name].append(float(line[k]))
+                if abs(columns[name][-1]) >= LARGEST:
+                    raise ValueError(f"line {lines.line_num} has a number out of range")
+            if count > most:
+                raise ValueError(f"it has more than {most} rows")
     except (ValueError, csv.Error) as error:
-        raise InputError(f"{path} is damaged ({error}); remove it, or repeat the run.") from error
-    return rows
+        raise _damaged(path, error) from error
+    return columns

@@ -34,11 +34,11 @@ from dora.agents.learners.finite import check_modules, check_tensors
 from dora.agents.learners.learner import Learner, agents_of, make_learner
 from dora.agents.runs.interrupt import Interrupt
 from dora.agents.runs.logging import RunLog
+from dora.agents.runs.machine import OtherLoad
 from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.configs import built
 from dora.errors import RECORDS, WorkerFailure
-from dora.machine import OtherLoad
 from dora.progress import ProgressDisplay
 
 TRAINING_SEEDS = 1_000_000_000
@@ -187,7 +187,7 @@ class Trainer:
             other_seconds=counters.other_seconds,
         )
         if evaluation is not None:
-            self.folder.write_evaluation(evaluation)
+            self.folder.write_evaluation(evaluation, zero)
         self.folder.write_result(result)
         return result
 

@@ -1,13 +1,15 @@
 """Tables and curves from finished runs: everything a README may claim, made from files."""
 
+import base64
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, stdev
 from urllib.parse import quote
 
 from dora.agents.evaluation.intervals import share_text
-from dora.agents.runs.figures import SECONDS_PER_MINUTE, draw_curves
-from dora.agents.runs.run_results import DEFAULT_PRESET, Run, find_runs, grouped, success_shares, zero_shares
+from dora.agents.reports.comparison import OVERLAP, Section, sections
+from dora.agents.reports.figures import SECONDS_PER_MINUTE, draw_curves, draw_overlap
+from dora.agents.reports.run_results import DEFAULT_PRESET, Run, find_runs, grouped, success_shares, zero_shares
 from dora.digests import digest_of
 from dora.files import make_folder, write_bytes
 from dora.tables import html_page, markdown_table, markdown_text
@@ -26,7 +28,7 @@ PAGE = """\
 <meta charset="utf-8">
 <title>Dora runs</title>
 <style>body{font-family:sans-serif;margin:2em}td,th{text-align:left;padding:.2em .8em;border-bottom:1px solid #ccc}
-img{max-width:100%}</style>
+img{max-width:100%}h2{margin-top:2em}</style>
 <h1>Runs in {{ root }}</h1>
 <table>
 <tr>{% for name in head %}<th>{{ name }}</th>{% endfor %}</tr>
@@ -35,11 +37,21 @@ img{max-width:100%}</style>
 {%- endfor %}
 </table>
 <p>{{ note }}</p>
-{%- for figure in figures %}
-<p><img src="{{ figure | urlencode }}"></p>
+{%- for name, picture in figures %}
+<p><img alt="{{ name }}" src="data:image/png;base64,{{ picture }}"></p>
+{%- endfor %}
+{%- for section in sections %}
+<h2>{{ section.title }}</h2>
+<table>
+<tr>{% for name in section.head %}<th>{{ name }}</th>{% endfor %}</tr>
+{%- for row in section.rows %}
+<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+{%- endfor %}
+</table>
+<p>{{ section.note }}</p>
 {%- endfor %}
 """
-"""Template of `report.html`."""
+"""Template of `report.html`, which needs no other file."""
 ALONE = 0.1
 """Cores that other programs may keep busy, on average, while a run counts as alone on its machine [1]."""
 SHARED, UNKNOWN = " \N{DAGGER}", " ?"
@@ -114,7 +126,8 @@ def file_name(name: str) -> str:
 
 
 def write_report(root: Path, out: Path) -> list[Path]:
-    """Writes `tables.md`, a figure for each task and preset, and `report.html` into `out`; returns their paths.
+    """Writes `tables.md`, `comparison.md` (sub-tasks, overlap, failures, the paper's tables), curves and overlap of
+    each task and preset as figures, and `report.html`, which holds all of it, into `out`; returns their paths.
 
     Raises:
         InputError: there is no finished run, a file of one is damaged, or `out` cannot be written.
@@ -122,12 +135,22 @@ def write_report(root: Path, out: Path) -> list[Path]:
     runs = find_runs(root)
     make_folder(out)
     write_bytes(out / "tables.md", f"{tables(runs)}\n{NOTE}\n".encode())
-    figures = []
+    compared, figures = sections(runs), list[Path]()
+    write_bytes(out / "comparison.md", "\n".join(map(_markdown, compared)).encode())
     for env, preset in sorted({run.group[:2] for run in runs if run.curve or run.progress}):
         name = env if preset == DEFAULT_PRESET else f"{env}-{preset}"
         figures.append(out / f"{file_name(name)}.png")
         draw_curves(runs, env, preset, figures[-1])
-    rows, names = table_rows(runs), [p.name for p in figures]
-    page = html_page(PAGE, root=root.name, head=HEADINGS, rows=rows, note=NOTE, figures=names)
-    write_bytes(out / "report.html", page.encode())
-    return [out / "tables.md", out / "report.html", *figures]
+        if any(run.group[:2] == (env, preset) and OVERLAP in run.episodes for run in runs):
+            figures.append(out / f"{file_name(name)}-overlap.png")
+            draw_overlap(runs, env, preset, figures[-1])
+    pictures = [(path.name, base64.b64encode(path.read_bytes()).decode()) for path in figures]
+    shown = {"head": HEADINGS, "rows": table_rows(runs), "note": NOTE, "figures": pictures, "sections": compared}
+    write_bytes(out / "report.html", html_page(PAGE, root=root.name, **shown).encode())
+    return [out / "tables.md", out / "comparison.md", out / "report.html", *figures]
+
+
+def _markdown(section: Section) -> str:
+    """A section of `comparison.md`."""
+    table = markdown_table(section.head, [[markdown_text(cell) for cell in row] for row in section.rows])
+    return f"## {section.title}\n\n{table}\n" + (f"\n{section.note}\n" if section.note else "")

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from dora.agents.config import NEUTRAL
 from dora.agents.evaluation.evaluate import FINAL_SEED
 from dora.agents.runs.progress_table import read_progress
-from dora.agents.runs.stored_results import read_curve, read_result
+from dora.agents.runs.stored_results import read_curve, read_episodes, read_result
 from dora.errors import InputError
 
 DEFAULT_PRESET = "standard"
@@ -24,12 +24,15 @@ Group = tuple[str, str, str, str, int]
 
 @dataclass(frozen=True)
 class Run:
-    """One finished run: its `result.json`, the rows of its `curve.csv`, the columns of its `progress.csv`."""
+    """One finished run: its `result.json`, the rows of its `curve.csv`, the columns of its `progress.csv`, and those of
+    `eval.csv` and `zero.csv` if they are there."""
 
     folder: Path
     result: dict[str, Any]
     curve: list[dict[str, float]]
     progress: dict[str, Float[np.ndarray, " rows"]] = field(default_factory=dict)
+    episodes: dict[str, Float[np.ndarray, " e"]] = field(default_factory=dict)
+    zero: dict[str, Float[np.ndarray, " z"]] = field(default_factory=dict)
 
     @property
     def group(self) -> Group:
@@ -62,10 +65,16 @@ def find_runs(root: Path) -> list[Run]:
         curve, progress = path.with_name("curve.csv"), path.with_name("progress.csv")
         if result is not None:
             rows = read_curve(curve) if curve.exists() else []
-            runs.append(Run(path.parent, result, rows, read_progress(progress) if progress.exists() else {}))
+            trained = read_progress(progress) if progress.exists() else {}
+            episodes, zero = (_episodes(path.with_name(name)) for name in ("eval.csv", "zero.csv"))
+            runs.append(Run(path.parent, result, rows, trained, episodes, zero))
     if not runs:
         raise InputError(f"there is no finished run under {root}: point at a folder with result.json files in it.")
     return runs
+
+
+def _episodes(path: Path) -> dict[str, Float[np.ndarray, " e"]]:
+    return {name: np.array(values) for name, values in read_episodes(path).items()} if path.exists() else {}
 
 
 def grouped(runs: Sequence[Run]) -> dict[Group, list[Run]]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from dora.agents.runs.run_results import Group, Run, grouped, zero_shares
+from dora.agents.reports.run_results import Group, Run, grouped, zero_shares
 from dora.files import write_bytes
 
 COLOURS = {
@@ -84,6 +84,42 @@ def draw_curves(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
     about = "greedy evaluation during training (mean and range over seeds; dotted: no correction)"
     below = f"\nbelow: training, smoothed over {SIGMA / EPOCHS:.0%} of the budget" if trained else ""
     figure.suptitle(f"{shortened(env)}, preset {shortened(preset)}: {about}{below}").set_parse_math(False)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=110)
+    pyplot.close(figure)
+    write_bytes(path, content.getvalue())
+
+
+def draw_overlap(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
+    """Share of evaluation episodes whose largest overlap stays below a depth, one line per learner and guidance, over
+    the episodes of all its seeds; dotted, zero correction."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axis = pyplot.subplots(figsize=(7, 4.2), layout="constrained")
+    deepest = 0.0
+    for group, members in grouped(runs).items():
+        if group[:2] != (env, preset):
+            continue
+        for tables, style in (([m.episodes for m in members], "-"), ([m.zero for m in members[:1]], ":")):
+            depths = [table["penetration_mm"] for table in tables if "penetration_mm" in table]
+            if depths:
+                depth = np.sort(np.concatenate(depths))
+                shares = np.arange(1, len(depth) + 1) / len(depth)
+                what = "" if style == "-" else ", zero correction"
+                label = f"{shortened(group[2])}, guidance {shortened(group[3])} ({len(depth)}){what}"
+                axis.step(depth, shares, style, where="post", color=COLOURS.get(group[2:4]), label=label)
+                deepest = max(deepest, float(np.percentile(depth, 99)))
+    axis.set_xlim(0, 1.05 * max(deepest, 1.0))
+    axis.set_ylim(0, 1.01)
+    axis.set_xlabel("largest overlap of an episode [mm]")
+    axis.set_ylabel("share of episodes below")
+    axis.grid(alpha=0.3)
+    for text in axis.legend(fontsize=7, loc="lower right").get_texts():
+        text.set_parse_math(False)
+    axis.set_title(f"{shortened(env)}, preset {shortened(preset)}", fontsize=10).set_parse_math(False)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110)
     pyplot.close(figure)

@@ -1,0 +1,288 @@
+"""Sections of a report that set runs beside each other and beside the paper: from their files alone."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import mean
+
+import numpy as np
+from jaxtyping import Float
+
+from dora.agents.reports.paper import DIFFERENCES, JUG_GAIN, MEAN_GAIN, ONE_ARM, PAPER, Cell
+from dora.agents.reports.run_results import DEFAULT_PRESET, Run, grouped, zero_shares
+from dora.agents.reports.statistics import Interval, aggregates, crossed_interval, mean_of_curve, paired_difference
+
+NONE = "-"
+"""Cell of a table for which there is no run."""
+OVERLAP = "penetration_mm"
+"""Column of an episode's largest overlap [mm]."""
+SECONDS = 60.0
+"""Seconds of a minute [s]."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A table of a report.
+
+    Attributes:
+        title: above it.
+        head: names of its columns.
+        rows: cells.
+        note: below it.
+    """
+
+    title: str
+    head: tuple[str, ...]
+    rows: list[list[str]]
+    note: str = ""
+
+
+def sections(runs: Sequence[Run]) -> list[Section]:
+    """All tables for which there are runs."""
+    cells = of_the_paper(runs)
+    made = [_differences(runs), _stages(runs), _overlap(runs), _failures(runs), _gains(cells)]
+    if cells:
+        made += [_success(cells), _minutes(cells), _claims(cells), _setup(), *_aggregated(cells)]
+    return [section for section in made if section.rows]
+
+
+def of_the_paper(runs: Sequence[Run]) -> dict[Cell, list[Run]]:
+    """The runs of each cell of the paper's tables: preset `standard`, the task's own reward, trained. Of several
+    variants of a task's numbers that with most runs, the first of equals."""
+    found: dict[Cell, list[Run]] = {}
+    for (env, preset, agent, guidance, _), members in grouped(runs).items():
+        cell = env, agent, guidance.partition(",")[0]
+        if preset == DEFAULT_PRESET and cell in PAPER and len(members) > len(found.get(cell, [])):
+            found[cell] = members
+    return found
+
+
+def success_of(runs: Sequence[Run]) -> Float[np.ndarray, "seeds starts"] | None:
+    """Outcomes of all seeds on the starts that all were evaluated on; None if their episodes are not there."""
+    return _outcomes([run.episodes for run in runs], [run.result.get("first_seed") for run in runs])
+
+
+def _outcomes(
+    tables: Sequence[Mapping[str, Float[np.ndarray, " e"]]], first: Sequence[int | None]
+) -> Float[np.ndarray, "seeds starts"] | None:
+    columns = [table.get("success") for table in tables]
+    known = [column for column in columns if column is not None]
+    alike = len(known) == len(columns) and len({len(c) for c in known}) == 1 and len(set(first)) == 1
+    return np.stack(known) if known and alike else None
+
+
+def _rate(runs: Sequence[Run]) -> float:
+    """Mean success [%]."""
+    return 100 * mean(run.result["success_rate"] for run in runs)
+
+
+def with_interval(value: float, interval: Interval, sign: bool = False) -> str:
+    """A percentage and its interval, given as shares."""
+    form = "+.1f" if sign else ".1f"
+    return f"{100 * value:{form}} [{100 * interval[0]:{form}}, {100 * interval[1]:{form}}]"
+
+
+def _success(cells: Mapping[Cell, list[Run]]) -> Section:
+    rows = []
+    for cell, printed in PAPER.items():
+        runs = cells.get(cell, [])
+        ours = raw = NONE
+        if runs:
+            outcomes = success_of(runs)
+            ours = (
+                f"{_rate(runs):.1f}" if outcomes is None else with_interval(outcomes.mean(), crossed_interval(outcomes))
+            )
+            known = [run.result.get("raw_success_rate") for run in runs]
+            raw = NONE if None in known else f"{100 * mean(rate for rate in known if rate is not None):.1f}"
+        rows.append([*cell, str(len(runs)), ours, raw, f"{printed.success:.1f} ± {printed.deviation:.1f}"])
+    head = ("task", "learner", "guidance", "seeds", "success %", "overlap not counted %", "paper %")
+    note = "In brackets the bootstrap interval over seeds and starts, where the episodes of all runs are there."
+    return Section("Overall success beside the paper's tables I and IV", head, rows, note)
+
+
+def _minutes(cells: Mapping[Cell, list[Run]]) -> Section:
+    rows = [
+        [*cell, f"{mean(run.result['wall_seconds'] for run in cells[cell]) / SECONDS:.1f}", f"{printed.minutes:.1f}"]
+        for cell, printed in PAPER.items()
+        if cell in cells and printed.minutes is not None
+    ]
+    note = "Ours on two CPU cores with all evaluations, the paper's on an RTX 4090."
+    return Section(
+        "Minutes of a run beside the paper's table III", ("task", "learner", "guidance", "minutes", "paper"), rows, note
+    )
+
+
+def _pairs(cells: Mapping[Cell, list[Run]]) -> Iterator[tuple[str, str, list[Run], list[Run]]]:
+    """Task, learner, guided and unguided runs, where there are both."""
+    for env, agent, guidance in PAPER:
+        if guidance == "affordance" and {(env, agent, guidance), (env, agent, "none")} <= set(cells):
+            yield env, agent, cells[env, agent, guidance], cells[env, agent, "none"]
+
+
+def _gains(cells: Mapping[Cell, list[Run]]) -> Section:
+    rows = []
+    for env, agent, guided, plain in _pairs(cells):
+        areas = [[a for r in runs if (a := mean_of_curve(r.curve, r.budget)) is not None] for runs in (guided, plain)]
+        area = f"{100 * (mean(areas[0]) - mean(areas[1])):+.1f}" if all(areas) else NONE
+        printed = PAPER[env, agent, "affordance"].success - PAPER[env, agent, "none"].success
+        final = _rate(guided) - _rate(plain)
+        rows.append([env, agent, f"{final:+.1f}", f"{printed:+.1f}", area, *(_steps(runs) for runs in (guided, plain))])
+    head = ("task", "learner", "gain", "gain in the paper", "gain of the mean over training",
+            "steps to 80 %, guided", "steps to 80 %, unguided")  # fmt: skip
+    note = "Guidance `affordance` less `none`, in points of success."
+    return Section("What guidance gains", head, rows, note)
+
+
+def _steps(runs: Sequence[Run]) -> str:
+    """Steps to 80 % of the seeds that reached it."""
+    known = [run.result.get("steps_to_80") for run in runs]
+    reached = [steps for steps in known if steps is not None]
+    return f"{mean(reached) / 1000:.0f}k ({len(reached)} of {len(known)})" if reached else f"never (0 of {len(known)})"
+
+
+def _claims(cells: Mapping[Cell, list[Run]]) -> Section:
+    rates = {cell: _rate(runs) for cell, runs in cells.items()}
+
+    def row(claim: str, paper: str, needed: Sequence[Cell], ours: str, holds: bool) -> list[str]:
+        missing = [
+            f"{env} {agent} {guidance}" for env, agent, guidance in needed if (env, agent, guidance) not in cells
+        ]
+        if missing:
+            return [claim, paper, NONE, f"runs are missing: {', '.join(missing)}"]
+        return [claim, paper, ours, "reproduced" if holds else "not reproduced"]
+
+    one_arm = [cell for cell in PAPER if cell[0] in ONE_ARM]
+    guided = [cell for cell in one_arm if cell[2] == "affordance"]
+    gains = [rates.get(cell, 0.0) - rates.get((*cell[:2], "none"), 0.0) for cell in guided]
+    jug = ("DoraJug-v1", "PPO", "affordance"), ("DoraJug-v1", "PPO", "none")
+    jug_gain = rates.get(jug[0], 0.0) - rates.get(jug[1], 0.0)
+    best = {}
+    for env in ONE_ARM:
+        ppo, sac = (rates.get((env, agent, "affordance"), 0.0) for agent in ("PPO", "SAC"))
+        best[env] = "PPO" if ppo > sac else "SAC"
+    wanted = {"DoraCube-v1": "PPO", "DoraJug-v1": "PPO", "DoraHammer-v1": "SAC"}
+    mean_gain, learners = mean(gains), ", ".join(f"{env}: {agent}" for env, agent in best.items())
+    average = "affordance gains on average over tasks 1 to 3 and both learners"
+    rows = [
+        row(average, f"{MEAN_GAIN:+.1f}", one_arm, f"{mean_gain:+.1f}", mean_gain >= MEAN_GAIN),
+        row("affordance gains on the jug with PPO", f"{JUG_GAIN:+.1f}", jug, f"{jug_gain:+.1f}", jug_gain >= JUG_GAIN),
+        row("PPO is better on cube and jug, SAC on the hammer", "yes", guided, learners, best == wanted),
+    ]
+    for env in (*ONE_ARM, "DoraMicrowave-v1"):
+        both = [cell for cell in PAPER if cell[0] == env and cell[2] == "affordance"]
+        bar = max(PAPER[cell].success for cell in both)
+        worst = min((rates.get(cell, 0.0) for cell in both), default=0.0)
+        claim = f"both guided learners are above the paper's best on {env}"
+        rows.append(row(claim, f"{bar:.1f}", both, f"{worst:.1f}", worst > bar))
+    return Section("The paper's claims", ("claim", "paper", "here", "verdict"), rows)
+
+
+def _setup() -> Section:
+    return Section("How the set-ups differ", ("what", "paper", "here"), [list(row) for row in DIFFERENCES])
+
+
+def _aggregated(cells: Mapping[Cell, list[Run]]) -> list[Section]:
+    """Mean and interquartile mean over tasks 1 to 3, of learners with the same seeds in all of them."""
+    scores = {}
+    for agent in ("PPO", "SAC"):
+        for guidance in ("affordance", "none"):
+            runs = [cells.get((env, agent, guidance), []) for env in ONE_ARM]
+            fewest = min(map(len, runs))
+            if fewest >= 2:
+                shares = [[run.result["success_rate"] for run in one[:fewest]] for one in runs]
+                scores[f"{agent}, {guidance}"] = np.array(shares).T
+    found = aggregates(scores) if scores else {}
+    if found is None:
+        return [Section("Over tasks 1 to 3", ("",), [["needs rliable: pip install 'dora-manipulation[report]'"]])]
+    rows = [[name, str(len(scores[name])), *(with_interval(*pair) for pair in both)] for name, both in found.items()]
+    head = ("learner, guidance", "seeds", "mean %", "interquartile mean %")
+    return [Section("Over tasks 1 to 3", head, rows, "By rliable, stratified bootstrap over seeds.")]
+
+
+def _differences(runs: Sequence[Run]) -> Section:
+    rows = []
+    for (env, preset, agent, guidance, _), members in grouped(runs).items():
+        zero = _outcomes([run.zero for run in members], [run.result.get("first_seed") for run in members])
+        ours = success_of(members)
+        if zero is not None and ours is not None and zero.shape[1] == ours.shape[1]:
+            text = with_interval(*paired_difference(ours, zero[:1]), sign=True)
+        elif zero_shares(members):
+            text = f"{_rate(members) - 100 * mean(share for share, _ in zero_shares(members)):+.1f}"
+        else:
+            continue
+        rows.append([env, preset, agent, guidance, str(len(members)), text])
+    note = "In brackets the bootstrap interval over seeds and starts, where the episodes of both are there."
+    head = ("task", "preset", "learner", "guidance", "seeds", "points")
+    return Section("Learned less zero correction, on the same starts", head, rows, note)
+
+
+def _stages(runs: Sequence[Run]) -> Section:
+    rows = []
+    for (env, preset, agent, guidance, _), members in grouped(runs).items():
+        names = list(members[0].result.get("stage_rates") or {})
+        rates = [[run.result.get("stage_rates", {}).get(name) for run in members] for name in names]
+        known = [
+            (name, mean(r)) for name, r in zip(names, rates, strict=True) if all(isinstance(x, float | int) for x in r)
+        ]
+        if known:
+            rows.append([env, preset, agent, guidance, ", ".join(f"{name} {100 * rate:.1f}" for name, rate in known)])
+    return Section(
+        "Sub-tasks: share of episodes that reach each stage",
+        ("task", "preset", "learner", "guidance", "stages %"),
+        rows,
+    )
+
+
+def _overlap(runs: Sequence[Run]) -> Section:
+    rows = []
+    for (env, preset, agent, guidance, _), members in grouped(runs).items():
+        tables = [run.episodes[OVERLAP] for run in members if OVERLAP in run.episodes]
+        if tables:
+            depth = np.concatenate(tables)
+            cells = [f"{np.percentile(depth, q):.1f}" for q in (50, 90, 95, 99)]
+            rows.append([env, preset, agent, guidance, str(len(depth)), *cells, f"{depth.max():.1f}"])
+    head = ("task", "preset", "learner", "guidance", "episodes", "median", "90 %", "95 %", "99 %", "largest")
+    return Section("Largest overlap of an episode [mm]", head, rows, "In any physics step, of anything with anything.")
+
+
+def _failures(runs: Sequence[Run]) -> Section:
+    rows = []
+    for (env, preset, agent, guidance, _), members in grouped(runs).items():
+        tables = [run.episodes for run in members if run.episodes]
+        if tables:
+            kinds = failure_kinds(tables)
+            text = ", ".join(f"{kind} {100 * share:.1f}" for kind, share in kinds.items())
+            rows.append([env, preset, agent, guidance, text or "none"])
+    head = ("task", "preset", "learner", "guidance", "share of episodes %")
+    return Section("Why episodes fail", head, rows, "By the first stage that was not reached, or overlap alone.")
+
+
+def failure_kinds(tables: Sequence[Mapping[str, Float[np.ndarray, " e"]]]) -> dict[str, float]:
+    """Share of episodes that failed for each reason, the most frequent first.
+
+    Args:
+        tables: columns of the eval.csv of each run.
+    """
+    counts: dict[str, int] = {}
+    total = 0
+    for table in tables:
+        left = table["success"] == 0
+        total += len(left)
+        checks = [
+            ("simulation not finite", table.get("nonfinite")),
+            ("no grasp within reach", table.get("unreachable")),
+            ("overlap alone", table.get("raw_success")),
+        ]
+        for kind, column in checks:
+            if column is not None and len(column) == len(left):
+                left = _count(counts, kind, left, column > 0)
+        for name, column in table.items():
+            if name.startswith("stage/"):
+                left = _count(counts, f"before {name.removeprefix('stage/')}", left, column == 0)
+        _count(counts, "lost again at the end", left, left)
+    return {kind: count / total for kind, count in sorted(counts.items(), key=lambda item: -item[1]) if count}
+
+
+def _count(counts: dict[str, int], kind: str, left: np.ndarray, applies: np.ndarray) -> np.ndarray:
+    """Adds the episodes to which a reason applies; the mask of those that are left."""
+    counts[kind] = counts.get(kind, 0) + int((left & applies).sum())
+    return left & ~applies

@@ -1,0 +1,95 @@
+"""Intervals of success over seeds and starts, differences on the same starts, and aggregates over tasks."""
+
+import importlib
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+SAMPLES = 2000
+"""Samples of a bootstrap [1]."""
+SEED = 0
+"""Of the bootstrap's random numbers."""
+PERCENTILES = (2.5, 97.5)
+"""Ends of an interval [%]."""
+
+Interval = tuple[float, float]
+"""Its ends."""
+
+
+def crossed_interval(outcomes: Float[np.ndarray, "seeds starts"]) -> Interval:
+    """Bootstrap interval of the mean over seeds and starts, both drawn with replacement: a start that is hard is hard
+    for every seed, so episodes are not independent. With one seed, over starts alone.
+
+    Args:
+        outcomes: of each seed in the episode of each start.
+    """
+    generator = np.random.default_rng(SEED)
+    seeds, starts = outcomes.shape
+    means = [
+        outcomes[np.ix_(generator.integers(seeds, size=seeds), generator.integers(starts, size=starts))].mean()
+        for _ in range(SAMPLES)
+    ]
+    low, high = np.percentile(means, PERCENTILES)
+    return float(low), float(high)
+
+
+def paired_difference(
+    ours: Float[np.ndarray, "seeds starts"], theirs: Float[np.ndarray, "others starts"]
+) -> tuple[float, Interval]:
+    """Mean difference on the same starts with its bootstrap interval over starts, and over the seeds of each side.
+
+    Args:
+        ours: outcomes of each seed for each start.
+        theirs: the same of what is compared, such as zero correction (one row).
+    """
+    generator = np.random.default_rng(SEED)
+    found = []
+    for _ in range(SAMPLES):
+        starts = generator.integers(ours.shape[1], size=ours.shape[1])
+        sides = [x[np.ix_(generator.integers(len(x), size=len(x)), starts)].mean() for x in (ours, theirs)]
+        found.append(sides[0] - sides[1])
+    low, high = np.percentile(found, PERCENTILES)
+    return float(ours.mean() - theirs.mean()), (float(low), float(high))
+
+
+def mean_of_curve(curve: Sequence[Mapping[str, float]], budget: int) -> float | None:
+    """Mean success over the steps of a run: the area under its evaluations, with straight lines between them, the first
+    value before the first and the last after the last (runs that end early have reached what they wanted)."""
+    if not curve or budget <= 0:
+        return None
+    at = np.array([0.0, *(row["env_steps"] for row in curve), max(budget, curve[-1]["env_steps"])])
+    values = np.array([curve[0]["success_rate"], *(row["success_rate"] for row in curve), curve[-1]["success_rate"]])
+    return float(np.trapezoid(values, at) / at[-1])
+
+
+def aggregates(
+    scores: Mapping[str, Float[np.ndarray, "seeds tasks"]],
+) -> dict[str, list[tuple[float, Interval]]] | None:
+    """Mean and interquartile mean over seeds and tasks with stratified bootstrap intervals, by rliable (Agarwal et al.
+    2021); None if it is not installed.
+
+    Args:
+        scores: success of each seed in each task, by what is compared; at least two seeds.
+    """
+    try:
+        library: Any = importlib.import_module("rliable.library")
+        metrics: Any = importlib.import_module("rliable.metrics")
+    except ImportError:
+        return None
+
+    def both(x: np.ndarray) -> np.ndarray:
+        return np.array([metrics.aggregate_mean(x), metrics.aggregate_iqm(x)])
+
+    random = np.random.RandomState(SEED)  # what rliable takes
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # of what rliable calls
+        points, intervals = library.get_interval_estimates(dict(scores), both, reps=SAMPLES, random_state=random)
+    return {
+        name: [
+            (float(p), (float(low), float(high))) for p, low, high in zip(points[name], *intervals[name], strict=True)
+        ]
+        for name in scores
+    }
