@@ -80,7 +80,7 @@ class MicrowaveTask(Task):
     MAX_STEPS = 320
     ONE_SIZE: ClassVar[frozenset[str]] = frozenset({"microwave"})
     TABLE: ClassVar[TableTop] = TableTop((0.45, 0.0), (0.80, 0.75, 0.02))
-    CAMERA = ((-0.55, -1.05, 1.15), (0.52, -0.02, 0.20))
+    CAMERA = ((-0.45, 0.05, 1.15), (0.60, -0.03, 0.12))
     CAMERAS: ClassVar[Mapping[str, CameraSpec]] = {
         "hand_camera": HAND_CAMERA,
         "front_camera": CameraSpec(eye=(-0.25, -0.75, 0.85), target=(0.6, -0.05, 0.2), fov=1.0),
