@@ -45,6 +45,9 @@ class PPOConfig:
     """Weight of the value loss."""
     bound: float = 5e-3
     """Weight of the penalty on mean actions outside [-1, 1]."""
+    prior: float = 0.0
+    """Weight of the squared mean action, summed over its components: pulls towards no correction where the advantage
+    does not tell actions apart, such as those of an arm that has done its part."""
     grad_norm: float = 1.0
     """The gradients of actor and critic are each scaled down to this norm."""
     learning_rate: float = 5e-4
@@ -119,6 +122,8 @@ class SACConfig:
 
 NEUTRAL = {"arm_effort": 1.0}
 """Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
+NEUTRAL_LEARNER = {name: {"prior": 0.0} for name in ("ppo", "mappo", "happo")}
+"""The same of settings of each learner."""
 DIGITS = 12
 """Hexadecimal digits of a digest of settings."""
 LEARNER_CONFIGS: dict[str, type[PPOConfig] | type[SACConfig]] = {
@@ -190,7 +195,8 @@ class RunConfig(Generic[Numbers, Settings, Agent]):
 
     def digest(self) -> str:
         """Twelve hexadecimal digits that differ between settings; `total_steps` may grow and is left out. So are the
-        dense reward and the numbers of `NEUTRAL` that change nothing, for settings of versions that had no other."""
+        dense reward and the numbers of `NEUTRAL` and `NEUTRAL_LEARNER` that change nothing, for settings of versions
+        that had no other."""
         return digest_of(_digested(plain(self)))[:DIGITS]
 
 
@@ -198,14 +204,17 @@ def _digested(content: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that enter a digest."""
     left_out = {"total_steps"} | ({"reward"} if content.get("reward") == "dense" else set())
     task = {name: value for name, value in content.get("task", {}).items() if NEUTRAL.get(name) != value}
-    return {name: value for name, value in content.items() if name not in left_out} | {"task": task}
+    neutral, learner = NEUTRAL_LEARNER.get(content.get("agent", ""), {}), content.get("learner", {})
+    learner = {name: value for name, value in learner.items() if neutral.get(name) != value}
+    kept = {name: value for name, value in content.items() if name not in left_out}
+    return kept | {"task": task, "learner": learner}
 
 
 def stored_digests(content: Mapping[str, Any]) -> tuple[str, ...]:
     """The digests that settings may have been stored with: that of `RunConfig.digest`, that of versions that left no
     number of the task out, and that of the versions whose `task` held only preset and parts of guidance."""
     settings = _digested(content)
-    whole = settings | {"task": content.get("task", {})}
+    whole = settings | {"task": content.get("task", {}), "learner": content.get("learner", {})}
     first = {name: value for name, value in settings.items() if name != "task" or value}
     text = json.dumps(first, sort_keys=True).encode()
     return digest_of(settings)[:DIGITS], digest_of(whole)[:DIGITS], hashlib.sha256(text).hexdigest()[:DIGITS]

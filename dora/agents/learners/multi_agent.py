@@ -24,7 +24,7 @@ from dora.agents.agent_columns import Agents
 from dora.agents.config import HAPPOConfig, MAPPOConfig, PPOConfig
 from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, GaussianActor, JointActor, Normaliser, Policy, for_loss
-from dora.agents.learners.ppo import ADAM_EPSILON, adapted, excess, standardised, transitions
+from dora.agents.learners.ppo import ADAM_EPSILON, adapted, excess, squared, standardised, transitions
 
 Passes = Sequence[Int[Tensor, " b"]]
 """The order of the transitions in each pass over a batch; the same for all agents and the critic."""
@@ -163,7 +163,9 @@ class AgentUpdate:
         divergence = float(torch.stack([values[-1] for values in steps[-1]]).mean())
         _set_learning_rate(self.optimiser, adapted(self.learning_rate, divergence, self.config))
         means = torch.stack([values for one in steps for values in one]).mean(0).tolist()
-        found = dict(zip(("policy", "entropy", "bound", "clip_fraction", "grad_norm"), means[:-1], strict=True))
+        found = dict(
+            zip(("policy", "entropy", "bound", "clip_fraction", "grad_norm", "correction"), means[:-1], strict=True)
+        )
         found |= {"kl": divergence, "learning_rate": self.learning_rate}
         std = {} if self._gaussian is None else {"action_std": float(self._gaussian.log_std.detach().exp().mean())}
         return found | std
@@ -174,17 +176,20 @@ class AgentUpdate:
         log_prob = self.policy.get_dist(data).log_prob(data["action"])
         return (log_prob - data["action_log_prob"]).exp()[:, None]
 
-    def _step(self, minibatch: TensorDict) -> Float[Tensor, " 6"]:
+    def _step(self, minibatch: TensorDict) -> Float[Tensor, " 7"]:
         """One gradient step; returns losses, the gradient's norm and the divergence."""
         out = self.loss(minibatch)
         bound = excess(self._mean)
-        total = out["loss_objective"] + out["loss_entropy"] + self.config.bound * bound
+        pulled = self.config.bound * bound + self.config.prior * squared(self._mean)
+        total = out["loss_objective"] + out["loss_entropy"] + pulled
         parameters = list(self.policy.parameters())
         norm = _descend(self.optimiser, total, parameters, self.config.grad_norm, f"actor of {self.name}")
         if self._gaussian is not None:
             with torch.no_grad():
                 self._gaussian.log_std.clamp_(self.config.log_std_min, 0.0)
         values = [out["loss_objective"], out["entropy"].mean(), bound, out["clip_fraction"].mean(), norm]
+        correction = self._mean.detach().square().mean().sqrt()
+        values += [correction.nan_to_num()]  # without a mean: it is another distribution
         return torch.stack([v.detach() for v in values] + [out["kl_approx"].detach().mean()])
 
     def _keep_mean(self, module: nn.Module, inputs: object, outputs: tuple[Tensor, Tensor]) -> None:

@@ -103,7 +103,7 @@ class PPO:
         self.set_learning_rate(adapted(self.learning_rate, divergence, self.config))
         means = torch.stack(losses).mean(0).tolist()
         self.normaliser.update(batch["observation"])
-        names = ("policy", "value", "entropy", "bound", "clip_fraction", "grad_norm")
+        names = ("policy", "value", "entropy", "bound", "clip_fraction", "grad_norm", "correction")
         return dict(zip(names, means[:-1], strict=True)) | {
             "kl": divergence,
             "learning_rate": self.learning_rate,
@@ -111,12 +111,13 @@ class PPO:
             "explained_variance": float(data["explained"][0]),
         }
 
-    def _step(self, minibatch: TensorDict) -> Float[Tensor, " 7"]:
+    def _step(self, minibatch: TensorDict) -> Float[Tensor, " 8"]:
         """One gradient step; returns the losses, the gradient's norm and the divergence."""
         minibatch["advantage"] = standardised(minibatch["advantage"])
         out = self.loss(minibatch)
         bound = excess(self._mean)
-        total = out["loss_objective"] + out["loss_entropy"] + out["loss_critic"] + self.config.bound * bound
+        total = out["loss_objective"] + out["loss_entropy"] + out["loss_critic"]
+        total = total + self.config.bound * bound + self.config.prior * squared(self._mean)
         check_loss("loss", total)
         self.optimiser.zero_grad()
         total.backward()
@@ -129,6 +130,7 @@ class PPO:
             self.actor.log_std.clamp_(self.config.log_std_min, 0.0)
         names = ("loss_objective", "loss_critic", "entropy")
         values = [out[name].mean() for name in names] + [bound, out["clip_fraction"].mean(), norm]
+        values += [self._mean.detach().square().mean().sqrt()]
         return torch.stack([v.detach() for v in values] + [out["kl_approx"].detach().mean()])
 
     def _keep_mean(self, module: nn.Module, inputs: object, outputs: tuple[Tensor, Tensor]) -> None:
@@ -173,6 +175,11 @@ def standardised(advantage: Float[Tensor, "b 1"]) -> Float[Tensor, "b 1"]:
 def excess(mean: Float[Tensor, "*b a"]) -> Float[Tensor, ""]:
     """Mean over the transitions of the squared excess of mean actions over [-1, 1]."""
     return (mean.abs() - 1).clamp_min(0).square().sum(-1).mean()
+
+
+def squared(mean: Float[Tensor, "*b a"]) -> Float[Tensor, ""]:
+    """Mean over the transitions of the squared mean actions, summed over their components."""
+    return mean.square().sum(-1).mean()
 
 
 def adapted(rate: float, divergence: float, config: PPOConfig) -> float:
