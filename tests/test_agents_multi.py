@@ -235,7 +235,7 @@ def test_agents_that_learn_at_once_do_not_depend_on_each_other():
 @pytest.mark.parametrize("agent", BOTH)
 def test_one_agent_is_ppo(agent: str):
     """The class itself, where PPO's minibatch is the whole batch and advantages are standardised over the same."""
-    settings = {**SETTINGS, "minibatch": 10**6}
+    settings = {**SETTINGS, "minibatch": 10**6, "prior": 0.02}
     torch.manual_seed(0)
     ppo = PPO(PPOConfig(**settings), *SIZES, 1000)
     with torch.no_grad():
@@ -252,7 +252,8 @@ def test_one_agent_is_ppo(agent: str):
         for one, data in ((ppo, batch), (learner, joint)):
             torch.manual_seed(10 + k)
             found.append(one.update(data))
-        for name in ("policy", "kl", "learning_rate", "entropy", "bound", "clip_fraction", "grad_norm", "action_std"):
+        for name in ("policy", "kl", "learning_rate", "entropy", "bound", "clip_fraction", "grad_norm", "action_std",
+                     "correction"):  # fmt: skip
             assert found[1][f"{name}/all"] == pytest.approx(found[0][name], rel=1e-3, abs=1e-5), name
         for name in ("value", "explained_variance"):
             assert found[1][name] == pytest.approx(found[0][name], rel=1e-3, abs=1e-5), name
@@ -298,6 +299,32 @@ def test_time_limits_bootstrap_and_failures_do_not(ended: str, monkeypatch: pyte
     wanted = (1 - gamma) * batch["next", "reward"][:, -1] + left * gamma * following - value
     learner.update(batch)
     torch.testing.assert_close(kept[0].unflatten(0, (8, 16))[:, -1], wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_the_prior_pulls_mean_actions_to_no_correction():
+    """Where the advantage tells nothing, corrections shrink with it and stay as they are without it. That it is the same
+    for agents as for PPO, `test_one_agent_is_ppo` shows."""
+    sizes = []
+    for prior in (0.0, 0.5):
+        torch.manual_seed(0)
+        ppo = PPO(PPOConfig(**SETTINGS, prior=prior, entropy=0.0), *SIZES, 1000)
+        with torch.no_grad():
+            last_layer(ppo.actor.mean).bias.fill_(0.5)
+        batch = batch_of(ppo)
+        batch["next", "reward"] = torch.zeros_like(batch["next", "reward"])
+        with torch.no_grad():
+            last_layer(ppo.critic.net).weight.zero_()
+            last_layer(ppo.critic.net).bias.zero_()
+        sizes.append([ppo.update(batch)["correction"] for _ in range(4)][-1])
+    assert sizes[0] == pytest.approx(0.5, abs=0.02)
+    assert sizes[1] < 0.95 * sizes[0]
+
+
+def test_only_guided_runs_are_pulled():
+    learners = {"ppo": {"learner": {"prior": 0.02}}}
+    for agent in ("ppo", "happo"):
+        guided, free = (recommended("X-v1", agent, learners, guidance=name).learner for name in ("affordance", "none"))
+        assert (guided.prior, free.prior) == (0.02, 0.0)
 
 
 def test_learning_rates_are_adapted_for_each_agent():

@@ -50,7 +50,9 @@ TAGS: dict[str, str] = {
     "learner/correction": "root mean square of the mean action over the batch (SAC: before the tanh)",
     "learner/explained_variance": "PPO: 1 - Var(target - value) / Var(target); 1 is perfect",
     "learner/factor_std/<agent>": "HAPPO: deviation of the compounded ratio by which its advantages are multiplied",
-    "learner/<value>/<agent>": "MAPPO, HAPPO: the same of one agent, except explained_variance",
+    "learner/<value>/<agent>": (
+        "MAPPO, HAPPO: entropy, kl, clip_fraction, learning_rate, grad_norm, action_std, correction of one"
+    ),
     "learner/alpha": "SAC: temperature",
     "learner/updates": "SAC: gradient steps so far",
     "learner/replay": "SAC: transitions in the replay buffer",
