@@ -302,8 +302,8 @@ def test_time_limits_bootstrap_and_failures_do_not(ended: str, monkeypatch: pyte
 
 
 def test_the_prior_pulls_mean_actions_to_no_correction():
-    """Where the advantage tells nothing, corrections shrink with it and stay as they are without it. That it is the same
-    for agents as for PPO, `test_one_agent_is_ppo` shows."""
+    """Where the advantage tells nothing, corrections shrink with it and stay as they are without it. That agents do as
+    PPO does is shown by `test_one_agent_is_ppo`."""
     sizes = []
     for prior in (0.0, 0.5):
         torch.manual_seed(0)
