@@ -5,11 +5,14 @@ import json
 
 import tyro
 
+from dora.agents.learners import benchmark as learner_benchmark
+from dora.agents.runs.recommended import recommended
 from dora.errors import command
 from dora.parallel import available_cores
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.tables import print_table
+from dora.tasks import find_task, make_task
 from dora.tools import env_benchmark as benchmark
 from dora.tools import grasp_benchmark
 from dora.tools import physics_benchmark as task_physics
@@ -49,6 +52,24 @@ def bench_grasp(object: str = "cube", robot: str = "diana7_hit", json: bool = Fa
         json: print one JSON object on the last line instead of a table.
     """
     report(dataclasses.asdict(grasp_benchmark.measure(object, load_robot(robot))), json)
+
+
+@app.command(name="learner")
+def bench_learner(env: str = "DoraCube-v1", agent: str = "ppo", seconds: float = 5.0, json: bool = False) -> None:
+    """Gradient steps per second of a learner with a task's recommended settings, against the same in plain torch.
+
+    Args:
+        env: a Dora id, for the settings and the numbers of components.
+        agent: ppo or sac.
+        seconds: length of each of the six measurements [s].
+        json: print one JSON object on the last line instead of a table.
+    """
+    config = recommended(env, agent, find_task(env).LEARNERS)
+    task = make_task(env, 1)
+    observation = sum(entry.value(task.snapshot).shape[-1] for entry in task.observation_entries.values())
+    speed = learner_benchmark.measure(config, observation, task.action_size, seconds)
+    task.close()
+    report(dataclasses.asdict(speed), json)
 
 
 PHYSICS = ("120:10:8", "240:2:8", "240:3:6", "240:5:4", "240:5:8", "240:10:4", "240:10:8", "240:10:15", "480:10:8")
