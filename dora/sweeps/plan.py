@@ -22,7 +22,7 @@ AFFORDANCE, GRASPS, NONE, PAPERS = ("affordance", None), ("grasps", None), ("non
 """The kinds of guidance that are compared."""
 ONE_ARM = {"DoraCube-v1": 300_000, "DoraJug-v1": 300_000, "DoraHammer-v1": 300_000}
 """Environment steps of a run of each task of one arm, the same for all learners."""
-TWO_ARMS = {"DoraMicrowave-v1": 600_000}
+TWO_ARMS = {"DoraMicrowave-v1": 400_000}
 """The same of tasks of two arms."""
 
 

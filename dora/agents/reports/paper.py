@@ -55,7 +55,7 @@ DIFFERENCES = (
     ("action", "change of the wrist's pose, hand joints", "the same as a residual on a scripted reference"),
     ("randomisation", "not said", "size, mass, friction, pose, candidate error, observation noise (docs/guidance.md)"),
     ("training", "10,000 epochs with batches of 32",
-     "300,000 steps (microwave 600,000), minibatches of 512 (PPO) and 256 (SAC)"),
+     "300,000 steps (microwave 400,000), minibatches of 512 (PPO) and 256 (SAC)"),
     ("evaluation", "mean and deviation, over what is not said", "500 starts that training never saw, for each seed"),
 )  # fmt: skip
 """What, in the paper, here."""

@@ -47,8 +47,8 @@ CLASSES = {LEFT: "HandleGrasp", RIGHT: "BodyGrasp"}
 """The grasp classes of the candidates of each arm."""
 
 RECOMMENDED: dict[str, Any] = {
-    "total_steps": 600_000, "stop_success": 0.97, "num_envs": 64, "eval_every": 200_000, "eval_episodes": 100,
-    "eval_envs": 50, "learner": {"rollout": 16, "log_std": -1.2},
+    "total_steps": 400_000, "stop_success": 0.97, "num_envs": 64, "eval_every": 100_000, "eval_episodes": 100,
+    "eval_envs": 50, "learner": {"rollout": 16, "log_std": -1.2, "target_kl": 0.0075, "prior": 0.02},
 }  # fmt: skip
 """Settings of every learner of this task."""
 
