@@ -48,7 +48,7 @@ CLASSES = {LEFT: "HandleGrasp", RIGHT: "BodyGrasp"}
 
 RECOMMENDED: dict[str, Any] = {
     "total_steps": 400_000, "stop_success": 0.97, "num_envs": 64, "eval_every": 100_000, "eval_episodes": 100,
-    "eval_envs": 50, "learner": {"rollout": 16, "log_std": -1.2, "target_kl": 0.0075, "prior": 0.02},
+    "eval_envs": 50, "learner": {"rollout": 16, "log_std": -1.2, "prior": 0.02},
 }  # fmt: skip
 """Settings of every learner of this task."""
 
