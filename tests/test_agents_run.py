@@ -279,7 +279,8 @@ def test_settings_without_a_reward_mean_the_dense_one_and_keep_their_digest():
     assert config_from_dict(content) == config
     del content["total_steps"]
     whole = digest_of(content)[:12]
-    assert content["task"].pop("arm_effort") == NEUTRAL["arm_effort"]
+    assert {name: content["task"].pop(name) for name in NEUTRAL} == NEUTRAL
+    assert content["learner"].pop("prior") == 0.0
     assert config.digest() == digest_of(content)[:12] == stored_digests(content)[0]
     assert whole in stored_digests(plain(config))
     weaker = dataclasses.replace(config, task=config.task | {"arm_effort": 0.5})

@@ -122,6 +122,8 @@ def test_the_preset_is_the_randomisation_that_can_be_overridden(env_id: str):
     ("changes", "words"),
     [
         ({"control_frequency": 0}, "is 0 and has to be from 1 to 10000"),
+        ({"pose_filter": 0.0}, "config.pose_filter is 0.0 and has to be from 0.01 to 1"),
+        ({"arm_effort": 1.5}, "config.arm_effort is 1.5 and has to be from 0.01 to 1"),
         ({"physics_frequency": 110}, "multiple of config.control_frequency, 20 Hz"),
         ({"lift": None}, "lift must be float"),
     ],

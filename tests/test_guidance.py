@@ -144,6 +144,46 @@ def test_what_is_seen_is_noisy_within_the_preset_and_the_truth_is_kept():
     assert clear.observed(s, {"arm": choice}, torch.zeros(n, dtype=torch.long)) is s
 
 
+def test_a_filtered_pose_is_the_running_mean_of_what_was_measured():
+    preset, n, share = PRESETS["standard"], 300, 0.2
+    keys = torch.rand(n, generator=torch.Generator().manual_seed(0))
+    raw, filtered = (Perturbations(preset, n, 26, {"arm": 20}, 0.05, CPU, share) for share in (1.0, share))
+    choice, s = {"arm": CandidateChoice(along_x(0.1), n, CPU)}, invented(n)
+    measured, spread = [], []
+    for one in (raw, filtered):
+        one.begin(torch.arange(n), keys)
+    for k in range(30):
+        step = torch.full((n,), k)
+        measured.append(raw.observed(s, choice, step).object.p)
+        seen = filtered.observed(s, choice, step)
+        assert torch.equal(filtered.observed(s, choice, step).object.p, seen.object.p)  # a read changes nothing
+        filtered.remember(seen)
+        spread.append(float(seen.object.p.std()))
+        if k < 1 / share - 1:
+            torch.testing.assert_close(seen.object.p, torch.stack(measured).mean(0))
+        torch.testing.assert_close(seen.object.q.norm(dim=-1), torch.ones(n))
+        torch.testing.assert_close(seen.goal.p, choice["arm"].goals(seen.object.p, seen.object.q)[0][:, 0])
+    expected = (share / (2 - share)) ** 0.5  # of an exponential mean of independent errors
+    assert spread[-1] / spread[0] == pytest.approx(expected, rel=0.15)
+    moved = invented(n, object_p=torch.full((n, 3), 0.2))
+    far = filtered.observed(moved, choice, torch.full((n,), 30)).object.p
+    assert torch.equal(far, raw.observed(moved, choice, torch.full((n,), 30)).object.p)
+    filtered.begin(torch.arange(n), keys)
+    assert torch.equal(filtered.observed(s, choice, torch.zeros(n).long()).object.p, measured[0])
+
+
+def test_a_restored_episode_goes_on_with_its_estimate():
+    task = tasks.make_task("DoraJug-v1", 3, config={"pose_filter": 0.15})
+    task.reset(seed=0)
+    for _ in range(6):
+        task.step(task.scripted_action())
+    state, seen = task.get_state_dict(), task.observed.objects["jug"].p
+    task.reset(seed=1)
+    task.set_state_dict(state)
+    torch.testing.assert_close(task.observed.objects["jug"].p, seen, atol=1e-6, rtol=0)
+    task.close()
+
+
 def test_delayed_actions_take_effect_later_and_the_first_at_once():
     late = Perturbations(Randomisation(delay=2), 1, 1, {"arm": 20}, 0.05, CPU)
     done = [late.delayed(torch.tensor([[float(k)]]), torch.tensor([k])).item() for k in range(6)]

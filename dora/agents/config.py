@@ -120,7 +120,7 @@ class SACConfig:
     """Widths of the hidden layers of actor and critics."""
 
 
-NEUTRAL = {"arm_effort": 1.0}
+NEUTRAL = {"arm_effort": 1.0, "pose_filter": 1.0}
 """Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
 NEUTRAL_LEARNER = {name: {"prior": 0.0} for name in ("ppo", "mappo", "happo")}
 """The same of settings of each learner."""

@@ -271,6 +271,7 @@ class DoraEnv(BaseEnv):
         action = checked_action(self.arms.joined(action), self.single_action_space, self.num_envs, self.device)
         step = self._elapsed_steps
         self.task.remember(self.snapshot)
+        self.perturbations.remember(self.observed)
         command = None
         if action is not None:
             self.memory.record_action(action)

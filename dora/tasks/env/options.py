@@ -18,8 +18,11 @@ from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import guidance_in_force
 from dora.tasks.mdp.randomisation import find_preset
 
-RATES = {"control_frequency": (1, 10_000), "physics_frequency": (1, 1_000_000), "solver_iterations": (1, 255)}
-"""Lowest and highest rates [Hz], and position iterations, of which PhysX takes 255."""
+RATES = {
+    "control_frequency": (1, 10_000), "physics_frequency": (1, 1_000_000), "solver_iterations": (1, 255),
+    "arm_effort": (0.01, 1.0), "pose_filter": (0.01, 1.0),
+}  # fmt: skip
+"""Lowest and highest rates [Hz], position iterations, of which PhysX takes 255, and shares."""
 SHARES = ("size", "mass", "hinge")
 """Half widths of the randomisation that are shares of what they change; a task may lack some."""
 MOST_DELAY = 1000

@@ -18,7 +18,7 @@ from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_
 from dora.tasks.guidance.candidate_choice import CandidateChoice
 from dora.tasks.mdp.buffers import Buffers
 from dora.tasks.mdp.randomisation import Randomisation
-from dora.tasks.mdp.snapshot import S, observed
+from dora.tasks.mdp.snapshot import S, Snapshot, observed
 
 KEYS = 2**24
 """Number of different keys [1]; each is exact in a float, as which states are stored."""
@@ -28,6 +28,10 @@ GOLDEN = 0x9E3779B9
 """2^32 over the golden ratio: multiples of it are spread evenly."""
 OBJECT_DRAWS, PUSH_DRAWS = 6, 2
 """Random numbers of a control step: position and rotation of each object; whether and where to push it."""
+MOVED = 0.03
+"""Distance of a measured position from the estimate from which the object counts as moved [m]."""
+ESTIMATE: dict[str, tuple[int, ...]] = {"count": (), "p": (3,), "q": (4,)}
+"""What is kept of an estimate: measurements in it, position [m], wxyz."""
 STILL = 2**20
 """Number of the control step, larger than that of any, from which errors are drawn that stay for an episode."""
 
@@ -56,6 +60,7 @@ class Perturbations:
         hands: number of hand joints of each arm.
         dt: duration of a control step [s].
         device: where the tensors are.
+        pose_filter: share of the newest measurement in the estimate of an object's pose; 1 is no filter.
     """
 
     def __init__(
@@ -66,14 +71,19 @@ class Perturbations:
         hands: Mapping[str, int],
         dt: float,
         device: torch.device | str,
+        pose_filter: float = 1.0,
     ):
         self.randomisation, self._dt = randomisation, dt
         self._sensors = {arm: OBJECT_DRAWS + size for arm, size in hands.items()}
-        self.buffers = Buffers(num_envs, device, key=(), waiting=(max(randomisation.delay, 1), action_size))
+        self._filtered = tuple(hands) if pose_filter < 1 and randomisation.noisy else ()
+        self._share = pose_filter
+        estimates = {f"{arm}_{name}": size for arm in self._filtered for name, size in ESTIMATE.items()}
+        waiting = (max(randomisation.delay, 1), action_size)
+        self.buffers = Buffers(num_envs, device, key=(), waiting=waiting, **estimates)
 
     def begin(self, rows: Int[Tensor, " b"], share: Float[Tensor, " b"]) -> None:
         """Starts new episodes in the environments `rows`; `share` in [0, 1) chooses their keys."""
-        self.buffers.write(rows, key=(share * KEYS).floor())
+        self.buffers.write(rows, key=(share * KEYS).floor(), **{f"{arm}_count": 0.0 for arm in self._filtered})
 
     def _draws(self, step: Tensor, start: int, size: int) -> Tensor:
         return uniform(self.buffers.key.long(), step.long(), start + size)[:, start:]
@@ -115,7 +125,7 @@ class Perturbations:
         hands, objects, goals = dict(s.hands), dict(s.objects), dict(s.goals)
         for arm, error in zip(self._sensors, errors, strict=True):
             body, name = s.objects[s.handles[arm]], s.handles[arm]
-            position, quaternion = self._displaced((body.p, body.q), error)
+            position, quaternion = self._estimated(arm, self._displaced((body.p, body.q), error))
             nearest_p, nearest_q, approach = choices[arm].goals(position, quaternion)
             objects[name] = replace(body, p=position, q=quaternion)
             hands[arm] = replace(s.hands[arm], q=s.hands[arm].q + r.observed_joint * error[:, OBJECT_DRAWS:])
@@ -129,6 +139,28 @@ class Perturbations:
             )
         still = 2 * self._draws(torch.full_like(step, STILL), 0, OBJECT_DRAWS) - 1
         return observed(s, hands, objects, goals, lambda pose: self._displaced(pose, still))
+
+    def _estimated(self, arm: str, measured: Pose) -> Pose:
+        """The running mean of the measured poses of what an arm handles, of all since the episode began at first, later
+        with the newest one's share; the measurement itself where it is far from that, because the object moves."""
+        if arm not in self._filtered:
+            return measured
+        count, p, q = (getattr(self.buffers, f"{arm}_{name}") for name in ESTIMATE)
+        share = (1 / (count + 1)).clamp_min(self._share)[:, None]
+        same = torch.where((q * measured[1]).sum(-1, keepdim=True) < 0, -measured[1], measured[1])
+        mean = q + share * (same - q)
+        new = ((count == 0) | ((measured[0] - p).norm(dim=-1) > MOVED))[:, None]
+        estimate = p + share * (measured[0] - p), mean / mean.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+        return torch.where(new, measured[0], estimate[0]), torch.where(new, measured[1], estimate[1])
+
+    def remember(self, observed: Snapshot) -> None:
+        """Takes note of the estimated poses of a control step, from which the next ones go on."""
+        for arm in self._filtered:
+            count, p = (getattr(self.buffers, f"{arm}_{name}") for name in ("count", "p"))
+            body = observed.objects[observed.handles[arm]]
+            jumped = (count == 0) | ((body.p - p).norm(dim=-1) > MOVED)
+            counted = torch.where(jumped, torch.ones_like(count), count + 1)
+            self.buffers.update(**{f"{arm}_count": counted, f"{arm}_p": body.p, f"{arm}_q": body.q})
 
     def _displaced(self, pose: Pose, error: Float[Tensor, "n numbers"]) -> Pose:
         """The pose with an error; the first six numbers of `error` are in [-1, 1)."""

@@ -154,7 +154,7 @@ class TaskScene:
         """Noise, delay and pushes of the randomisation for these arms."""
         hands = {name: len(arm.agent.description.hand) for name, arm in self.arms.items()}
         c = self.config
-        return Perturbations(c.randomisation, self.num_envs, action_size, hands, c.dt, self.device)
+        return Perturbations(c.randomisation, self.num_envs, action_size, hands, c.dt, self.device, c.pose_filter)
 
     def snapshot(self, machine: Stages, memory: EpisodeMemory, time: Float[Tensor, " n"]) -> Snapshot:
         """The state now; arguments as of `StateReader.snapshot`."""
