@@ -110,6 +110,10 @@ class SACConfig:
     """Target entropy of the policy, nats per action dimension."""
     prior: float = 0.05
     """Weight of the squared mean action (before the tanh), in units of mean reward: pulls towards no correction."""
+    prior_last: float | None = None
+    """That weight from `prior_steps` on, up to which it falls geometrically; None: it does not change."""
+    prior_steps: int = 100_000
+    """Environment steps after which `prior_last` is reached."""
     polyak: float = 0.03
     """Share by which the target critics follow the critics at each gradient step."""
     log_std_max: float = -1.1
@@ -122,7 +126,9 @@ class SACConfig:
 
 NEUTRAL = {"arm_effort": 1.0, "pose_filter": 1.0}
 """Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
-NEUTRAL_LEARNER = {name: {"prior": 0.0} for name in ("ppo", "mappo", "happo")}
+NEUTRAL_LEARNER = {name: {"prior": 0.0} for name in ("ppo", "mappo", "happo")} | {
+    "sac": {"prior_last": None, "prior_steps": 100_000}
+}
 """The same of settings of each learner."""
 DIGITS = 12
 """Hexadecimal digits of a digest of settings."""

@@ -26,7 +26,8 @@ class Task(Protocol):
     holds now), `penetration_mm` and `nonfinite` (the simulator gave NaN or infinity; such an episode ends). A task may
     have an attribute `ranking_steps`: simulated steps that ranking its candidates took; and `agent_columns`: by agent's
     name, the columns of the observation that it sees, and those of the action that it commands, for learners that tell
-    agents apart. Without it, one agent sees and commands everything.
+    agents apart. Without it, one agent sees and commands everything. Evaluation stores `start_numbers`, if the task has
+    it: numbers (N,) by name that say how the running episodes began.
     """
 
     @property
@@ -273,6 +274,11 @@ class TaskEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         self._pending_seed = seed
+
+    @property
+    def start_numbers(self) -> dict[str, Float[Tensor, " n"]]:
+        """How the running episodes began, by name; nothing if the task does not say."""
+        return dict(getattr(self.task, "start_numbers", {}))
 
     def restart(self, seeds: list[int]) -> TensorDictBase:
         """Reset every row, row i with seeds[i]."""

@@ -1,7 +1,7 @@
 """Evaluation: statistics of episodes on fixed seeds, with a policy that does not explore."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -56,12 +56,14 @@ class Evaluation:
     table: (E, K) values at the end of each episode.
     first_seed: seed of the first episode; those of the others follow.
     ranking_steps: simulated steps that ranking the task's candidates took; None if the task does not say.
+    starts: (E,) numbers by name that say how each episode began, as far as the task does.
     """
 
     columns: EpisodeColumns
     table: Float[Tensor, "e k"]
     first_seed: int = FINAL_SEED
     ranking_steps: int | None = None
+    starts: Mapping[str, Float[Tensor, " e"]] = field(default_factory=dict)
 
     def values(self, name: str) -> Float[Tensor, " e"]:
         """One column, sums of logged terms as means per step."""
@@ -125,20 +127,23 @@ class Evaluation:
         return self.penetration_mm(0.95)
 
     def rows(self) -> tuple[tuple[str, ...], list[list[Any]]]:
-        """Header and rows of `eval.csv`: episode number, then every column."""
+        """Header and rows of `eval.csv`: episode number, every column, and how the episode began as `start/<name>`."""
         names = tuple(n for n in self.columns.names if n != "whole")
-        values = torch.stack([self.values(n) for n in names], 1).tolist()
-        return ("episode", *names), [[i, *row] for i, row in enumerate(values)]
+        values = torch.stack([self.values(n) for n in names] + list(self.starts.values()), 1).tolist()
+        starts = (f"start/{name}" for name in self.starts)
+        return ("episode", *names, *starts), [[i, *row] for i, row in enumerate(values)]
 
 
 @torch.no_grad()
 def run_batch(env: TaskEnv, act: Act, first_seed: int) -> Float[Tensor, "n k"]:
-    """One episode per environment, with seeds first_seed, first_seed + 1, ...; their rows of an evaluation's table.
+    """One episode per environment, with seeds first_seed, first_seed + 1, ...; their rows of an evaluation's table, to
+    the right of them the numbers of how they began.
 
     Environments whose episode has ended go on stepping, uncounted, until all have ended.
     """
     n = env.batch_size[0]
     data = env.restart([first_seed + row for row in range(n)])
+    starts = [value[:, None].clone() for value in env.start_numbers.values()]
     table = torch.zeros_like(data["statistics"])
     running = torch.ones(n, dtype=torch.bool)
     while running.any():
@@ -147,7 +152,7 @@ def run_batch(env: TaskEnv, act: Act, first_seed: int) -> Float[Tensor, "n k"]:
         ended = running & data["done"][:, 0]
         table[ended] = data["statistics"][ended]
         running &= ~ended
-    return table
+    return torch.cat([table, *starts], 1)
 
 
 def outcome(evaluation: Evaluation, zero: Evaluation | None) -> str:

@@ -61,8 +61,9 @@ class Evaluators:
         size = self._config.eval_envs
         batches = [(weights, first_seed + start, min(size, episodes - start)) for start in range(0, episodes, size)]
         tables = self._helpers.map(batches, functools.partial(self._own, check=check), check=check, patience=PATIENCE)
-        table = torch.from_numpy(np.concatenate(tables))
-        return Evaluation(self.env.columns, table, first_seed, getattr(self.env.task, "ranking_steps", None))
+        table, *starts = torch.from_numpy(np.concatenate(tables)).tensor_split([len(self.env.columns.names)], 1)
+        named = dict(zip(self.env.start_numbers, starts[0].T, strict=True))
+        return Evaluation(self.env.columns, table, first_seed, getattr(self.env.task, "ranking_steps", None), named)
 
     def final(
         self,

@@ -56,7 +56,9 @@ class MultiAgentPPO:
         self.critic = Critic(observation, config.hidden, nn.ELU, layer_norm=False)
         self.policy = Policy(self.normaliser, self.actor, config.noise_correlation)
         self.updates = {n: AgentUpdate(n, for_loss(self.actor.of(n), IndependentNormal), config) for n in agents}
-        self.critic_adam = torch.optim.Adam(self.critic.parameters(), lr=config.learning_rate, eps=ADAM_EPSILON)
+        self.critic_adam = torch.optim.Adam(
+            self.critic.parameters(), lr=config.learning_rate, eps=ADAM_EPSILON, fused=True
+        )
 
     @property
     def modules(self) -> dict[str, nn.Module]:
@@ -141,7 +143,7 @@ class AgentUpdate:
             normalize_advantage=False,
             functional=False,
         )
-        self.optimiser = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=ADAM_EPSILON)
+        self.optimiser = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=ADAM_EPSILON, fused=True)
         self._mean = torch.empty(0)  # mean actions of the latest forward pass, for the penalty on their excess
         actor = policy[0].module
         self._gaussian = actor if isinstance(actor, GaussianActor) else None

@@ -43,7 +43,7 @@ class PlainPPO:
         self.actor.mean, self.actor.log_std = copy.deepcopy(ppo.actor.mean), nn.Parameter(ppo.actor.log_std.clone())
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.learning_rate = ppo.learning_rate
-        self.optimiser = torch.optim.Adam(parameters, lr=self.learning_rate, eps=ADAM_EPSILON)
+        self.optimiser = torch.optim.Adam(parameters, lr=self.learning_rate, eps=ADAM_EPSILON, fused=True)
 
     def update(self, batch: Batch) -> int:
         """Learn from a batch (N, T); the number of gradient steps."""
@@ -127,9 +127,11 @@ class PlainSAC:
         self.log_alpha = nn.Parameter(torch.tensor(c.alpha).log())
         self.entropy = c.target_entropy * action
         self.adams = {
-            "critic": torch.optim.Adam([p for one in self.critics for p in one.parameters()], lr=c.learning_rate),
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=c.learning_rate_actor),
-            "alpha": torch.optim.Adam([self.log_alpha], lr=c.learning_rate_alpha),
+            "critic": torch.optim.Adam(
+                [p for one in self.critics for p in one.parameters()], lr=c.learning_rate, fused=True
+            ),
+            "actor": torch.optim.Adam(self.actor.parameters(), lr=c.learning_rate_actor, fused=True),
+            "alpha": torch.optim.Adam([self.log_alpha], lr=c.learning_rate_alpha, fused=True),
         }
         sizes = {"observation": observation, "action": action, "next": observation, "reward": 1, "discount": 1}
         self.memory = {name: torch.zeros(c.capacity, size) for name, size in sizes.items()}
@@ -199,13 +201,12 @@ class PlainSAC:
         _descend(self.adams["critic"], sum(nn.functional.mse_loss(one, wanted) for one in found))
 
     def _learn_actor(self, part: Batch) -> None:
-        action, log_prob, _ = self._act(part["observation"])
+        action, log_prob, mean = self._act(part["observation"])
         for critic in self.critics:
             critic.requires_grad_(False)
         value = torch.minimum(*(critic(part["observation"], action) for critic in self.critics))[:, 0]
         for critic in self.critics:
             critic.requires_grad_(True)
-        mean, _ = self.actor(part["observation"])
         pulled = self.config.prior * mean.square().sum(-1).mean()
         _descend(self.adams["actor"], (self.log_alpha.detach().exp() * log_prob - value).mean() + pulled)
         _descend(self.adams["alpha"], -(self.log_alpha * (log_prob.detach() + self.entropy)).mean())

@@ -56,7 +56,7 @@ class PPO:
         self._mean = torch.empty(0)  # mean actions of the latest forward pass
         self.actor.register_forward_hook(self._keep_mean)
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimiser = torch.optim.Adam(parameters, lr=self.learning_rate, eps=ADAM_EPSILON)
+        self.optimiser = torch.optim.Adam(parameters, lr=self.learning_rate, eps=ADAM_EPSILON, fused=True)
 
     @property
     def modules(self) -> dict[str, nn.Module]:

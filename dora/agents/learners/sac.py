@@ -45,6 +45,7 @@ class SAC:
             loss_function="l2",
             alpha_init=config.alpha,
             target_entropy=config.target_entropy * action,
+            deactivate_vmap=True,  # two products of matrices are faster on a core than a batched one
         )
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
         self.target = SoftUpdate(self.loss, tau=config.polyak)
@@ -52,17 +53,28 @@ class SAC:
         self.critic_parameters = _leaves(self.loss.qvalue_network_params)
         log_alpha: Any = self.loss.log_alpha
         self.optimisers: dict[str, torch.optim.Optimizer] = {
-            "actor_adam": torch.optim.Adam(self.actor_parameters, lr=config.learning_rate_actor),
-            "critic_adam": torch.optim.Adam(self.critic_parameters, lr=config.learning_rate),
-            "alpha_adam": torch.optim.Adam([log_alpha], lr=config.learning_rate_alpha),
+            "actor_adam": torch.optim.Adam(self.actor_parameters, lr=config.learning_rate_actor, fused=True),
+            "critic_adam": torch.optim.Adam(self.critic_parameters, lr=config.learning_rate, fused=True),
+            "alpha_adam": torch.optim.Adam([log_alpha], lr=config.learning_rate_alpha, fused=True),
         }
         self.replay = Replay(config.capacity, config.batch)
+        self._acted = torch.empty(0), torch.empty(0)  # mean and standard deviation of the latest forward pass
+        self.actor.register_forward_hook(self._keep_acted)
         self.updates, self.due = 0, 0.0
 
     @property
     def modules(self) -> dict[str, nn.Module]:
         """What a checkpoint holds, by name."""
         return {"normaliser": self.normaliser, "actor": self.actor, "loss": self.loss}
+
+    @property
+    def prior(self) -> float:
+        """Weight of the pull towards no correction at this moment."""
+        c = self.config
+        if c.prior_last is None or c.prior == 0:
+            return c.prior
+        share = min(self.replay.added / c.prior_steps, 1.0)
+        return c.prior * (c.prior_last / c.prior) ** share
 
     def counters(self) -> dict[str, float]:
         """Gradient steps taken and due, transitions seen."""
@@ -116,10 +128,14 @@ class SAC:
         log_alpha: Any = self.loss.log_alpha
         return log_alpha.detach().exp()
 
+    def _keep_acted(self, module: nn.Module, inputs: object, outputs: tuple[Tensor, Tensor]) -> None:
+        """Forward hook: `SACLoss` hides the distribution whose mean the pull towards no correction needs."""
+        self._acted = outputs
+
     def _learn_actor(self, sample: TensorDict) -> Tensor:
         loss, metadata = self.loss.actor_loss(sample)
-        mean, std = self.actor(sample["features"])
-        total = loss + self.config.prior * mean.square().sum(-1).mean()
+        mean, std = self._acted
+        total = loss + self.prior * mean.square().sum(-1).mean()
         _descend(self.optimisers["actor_adam"], total, "loss of the actor")
         log_prob = metadata["log_prob"]
         alpha_loss = self.loss.alpha_loss(log_prob).mean()

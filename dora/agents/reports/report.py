@@ -10,6 +10,7 @@ from dora.agents.evaluation.intervals import share_text
 from dora.agents.reports.comparison import OVERLAP, Section, sections
 from dora.agents.reports.figures import SECONDS_PER_MINUTE, draw_curves, draw_overlap
 from dora.agents.reports.run_results import DEFAULT_PRESET, Run, find_runs, grouped, success_shares, zero_shares
+from dora.agents.reports.starts import draw_starts, has_starts, starts_section
 from dora.digests import digest_of
 from dora.files import make_folder, write_bytes
 from dora.tables import html_page, markdown_table, markdown_text
@@ -126,8 +127,9 @@ def file_name(name: str) -> str:
 
 
 def write_report(root: Path, out: Path) -> list[Path]:
-    """Writes `tables.md`, `comparison.md` (sub-tasks, overlap, failures, the paper's tables), curves and overlap of
-    each task and preset as figures, and `report.html`, which holds all of it, into `out`; returns their paths.
+    """Writes `tables.md`, `comparison.md` (sub-tasks, overlap, failures, the paper's tables, starts), curves, overlap
+    and success against starts of each task and preset as figures, and `report.html`, which holds all of it, into `out`;
+    returns their paths.
 
     Raises:
         InputError: there is no finished run, a file of one is damaged, or `out` cannot be written.
@@ -135,7 +137,8 @@ def write_report(root: Path, out: Path) -> list[Path]:
     runs = find_runs(root)
     make_folder(out)
     write_bytes(out / "tables.md", f"{tables(runs)}\n{NOTE}\n".encode())
-    compared, figures = sections(runs), list[Path]()
+    began, figures = starts_section(runs), list[Path]()
+    compared = [*sections(runs), *([began] if began.rows else [])]
     write_bytes(out / "comparison.md", "\n".join(map(_markdown, compared)).encode())
     for env, preset in sorted({run.group[:2] for run in runs if run.curve or run.progress}):
         name = env if preset == DEFAULT_PRESET else f"{env}-{preset}"
@@ -144,6 +147,9 @@ def write_report(root: Path, out: Path) -> list[Path]:
         if any(run.group[:2] == (env, preset) and OVERLAP in run.episodes for run in runs):
             figures.append(out / f"{file_name(name)}-overlap.png")
             draw_overlap(runs, env, preset, figures[-1])
+        if has_starts(runs, env, preset):
+            figures.append(out / f"{file_name(name)}-starts.png")
+            draw_starts(runs, env, preset, figures[-1])
     pictures = [(path.name, base64.b64encode(path.read_bytes()).decode()) for path in figures]
     shown = {"head": HEADINGS, "rows": table_rows(runs), "note": NOTE, "figures": pictures, "sections": compared}
     write_bytes(out / "report.html", html_page(PAGE, root=root.name, **shown).encode())

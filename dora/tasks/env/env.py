@@ -25,7 +25,7 @@ from dora.sim.cameras import camera_configs
 from dora.tasks.env.arm import Arm
 from dora.tasks.env.arm_group import ArmGroup
 from dora.tasks.env.description import describe
-from dora.tasks.env.episode_start import begin_episodes, drawn_sizes, requested
+from dora.tasks.env.episode_start import begin_episodes, drawn_sizes, requested, start_numbers
 from dora.tasks.env.options import check_grasps, check_options, task_config
 from dora.tasks.env.scene import TaskScene, film_camera, sim_config
 from dora.tasks.env.state import saved_state, set_rows, unflattened
@@ -347,6 +347,8 @@ class DoraEnv(BaseEnv):
         return {**pictures, "state": state} if pictures else state
 
     # ------------------------------------------------ the protocol of learners
+
+    start_numbers = property(start_numbers)
 
     @property
     def max_steps(self) -> int:

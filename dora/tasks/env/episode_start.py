@@ -10,6 +10,7 @@ from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from torch import Tensor
 
 from dora.arguments import checked_rows, checked_seeds
+from dora.geometry.rotations import rotation_angle
 from dora.sim.batch.resets import START, checked_options
 
 SCALE_DRAW = 256
@@ -86,6 +87,22 @@ def begin_episodes(env: Any, rows: Int[Tensor, " b"]) -> None:
         pose = env.objects[arm.spec.object].pose
         p, q = pose.p[rows], pose.q[rows]
         arm.choose(rows, p, q, env.task.reachable(arm, rows, p, q), e, randomisation, env.narrow.get(arm.name))
+
+
+def start_numbers(env: Any) -> dict[str, Float[Tensor, " n"]]:
+    """How the running episodes began, as far as it was drawn at random: of each object `size` relative to the nominal
+    one, `mass` [kg] and `friction`; of each arm the distance of its first candidate from what the set holds, as
+    `candidate_error_mm` and `candidate_error_deg`. Names end in `_<object>` or `_<arm>` where there are several."""
+    found: dict[str, Tensor] = {}
+    for k, name in enumerate(env.objects):
+        end, drawn = f"_{name}" if len(env.objects) > 1 else "", env.memory.objects[name]
+        found |= {f"size{end}": env.scale[:, k], f"mass{end}": drawn.mass, f"friction{end}": drawn.friction}
+    for name, choice in env.arms.choices.items():
+        end, held, chosen = f"_{name}" if len(env.arms) > 1 else "", choice.candidates, choice.buffers.chosen.long()
+        away = (choice.buffers.position[:, 0] - held.position[chosen]).norm(dim=-1)
+        turn = rotation_angle(choice.buffers.quaternion[:, 0], held.quaternion[chosen])
+        found |= {f"candidate_error_mm{end}": 1e3 * away, f"candidate_error_deg{end}": turn.rad2deg()}
+    return found
 
 
 def _draws(env: Any, rows: Tensor) -> tuple[Tensor, ...]:

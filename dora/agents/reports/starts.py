@@ -1,0 +1,119 @@
+"""Success against how episodes began: error of the candidate, mass, friction and size."""
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from dora.agents.evaluation.intervals import wilson
+from dora.agents.reports.comparison import Section
+from dora.agents.reports.figures import COLOURS, shortened
+from dora.agents.reports.run_results import Run, grouped
+from dora.files import write_bytes
+
+PREFIX = "start/"
+"""Of the columns of an eval.csv that say how its episode began."""
+PARTS = 4
+"""Parts with equally many episodes into which those of a group are divided [1]."""
+ACROSS = 3
+"""Pictures in a row of the figure [1]."""
+
+Episodes = Mapping[str, Float[np.ndarray, " e"]]
+"""Columns of an eval.csv, or of those of several seeds, one after the other."""
+Bin = tuple[float, float, int, int]
+"""Lowest and highest value of a number, episodes, successes."""
+
+
+def bins(episodes: Episodes, name: str) -> list[Bin]:
+    """Episodes in the order of a number of their start, in `PARTS` parts; none if it is the same in all.
+
+    Args:
+        episodes: columns, among them `success` and that of the number.
+        name: of its column.
+    """
+    values, success = episodes[name], episodes["success"]
+    if len(values) < PARTS or np.ptp(values) <= 1e-6 * np.abs(values).max():
+        return []
+    order = np.argsort(values, kind="stable")
+    parts = np.array_split(order, PARTS)
+    return [(values[p].min(), values[p].max(), len(p), round(success[p].sum())) for p in parts]
+
+
+def joined(tables: Sequence[Episodes]) -> dict[str, Float[np.ndarray, " all"]]:
+    """The columns that all tables have, one table after the other."""
+    names = [name for name in tables[0] if all(name in table for table in tables)] if tables else []
+    return {name: np.concatenate([table[name] for table in tables]) for name in names}
+
+
+def starts_section(runs: Sequence[Run]) -> Section:
+    """Success in each quarter of the episodes, in the order of each number that was drawn at their start."""
+    rows = []
+    for (env, preset, agent, guidance, _), members in grouped(runs).items():
+        episodes = joined([run.episodes for run in members])
+        for name in filter(_is_start, episodes):
+            cells = [f"{100 * hits / n:.1f} ({low:.3g} to {high:.3g})" for low, high, n, hits in bins(episodes, name)]
+            if cells:
+                rows.append([env, preset, agent, guidance, name.removeprefix(PREFIX), *cells])
+    head = ("task", "preset", "learner", "guidance", "number", "lowest quarter", "second", "third", "highest quarter")
+    note = "Success % over the episodes of all seeds, and in brackets the number's range in that quarter."
+    return Section("Success against how episodes began", head, rows, note)
+
+
+def _is_start(name: str) -> bool:
+    return name.startswith(PREFIX)
+
+
+def has_starts(runs: Sequence[Run], env: str, preset: str) -> bool:
+    """Whether some run of a task and preset says how its episodes began."""
+    return any(run.group[:2] == (env, preset) and any(map(_is_start, run.episodes)) for run in runs)
+
+
+def draw_starts(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
+    """Success over each number of the start, one line per learner and guidance with Wilson's intervals of each quarter
+    of its episodes; dotted, zero correction."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    lines = [
+        (joined(tables), style, members, group)
+        for group, members in grouped(runs).items()
+        if group[:2] == (env, preset)
+        for tables, style in (([m.episodes for m in members], "-"), ([m.zero for m in members[:1]], ":"))
+    ]
+    names = list(dict.fromkeys(n for episodes, *_ in lines for n in filter(_is_start, episodes) if bins(episodes, n)))
+    down = -(-max(len(names), 1) // ACROSS)
+    figure, axes = pyplot.subplots(
+        down, ACROSS, figsize=(13, 0.8 + 3.2 * down), layout="constrained", squeeze=False, sharey=True
+    )
+    for axis, name in zip(axes.flat, names, strict=False):
+        for episodes, style, members, group in lines:
+            parts = bins(episodes, name) if name in episodes else []
+            if parts:
+                ends = np.array([wilson(hits, n) for _, _, n, hits in parts])
+                share = np.array([hits / n for _, _, n, hits in parts])
+                middle = [(low + high) / 2 for low, high, _, _ in parts]
+                what = "" if style == "-" else ", zero correction"
+                label = f"{shortened(group[2])}, guidance {shortened(group[3])} ({len(members)}){what}"
+                axis.errorbar(
+                    middle, share, (share - ends[:, 0], ends[:, 1] - share), linestyle=style, marker="o", markersize=3,
+                    capsize=2, color=COLOURS.get(group[2:4]), label=label,
+                )  # fmt: skip
+        axis.set_xlabel(name.removeprefix(PREFIX).replace("_", " "))
+        axis.set_ylim(-0.02, 1.02)
+        axis.grid(alpha=0.3)
+    for axis in axes.flat[len(names) :]:
+        axis.set_axis_off()
+    axes[0, 0].set_ylabel("success")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    for text in figure.legend(handles, labels, fontsize=8, loc="outside lower center", ncols=2).get_texts():
+        text.set_parse_math(False)
+    title = f"{shortened(env)}, preset {shortened(preset)}: success in quarters of the episodes"
+    figure.suptitle(title).set_parse_math(False)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=110)
+    pyplot.close(figure)
+    write_bytes(path, content.getvalue())
