@@ -190,6 +190,14 @@ def test_differences_to_zero_correction_are_paired_where_the_episodes_are_there(
     assert jug.startswith("+40.0 [+2")
 
 
+def test_zero_correction_of_one_run_is_that_of_all_seeds(tmp_path: Path):
+    write_run(tmp_path / "a", "DoraJug-v1", "ppo", "affordance", 0.9, seed=10)
+    write_run(tmp_path / "b", "DoraJug-v1", "ppo", "affordance", 0.7, seed=11, zero=0.5)
+    ((*_, seeds, text),) = table(tmp_path, "Learned less zero correction")
+    assert seeds == "2"
+    assert text.startswith("+30.0 [+")
+
+
 def test_a_page_needs_no_other_file(tmp_path: Path):
     write_run(tmp_path / "a", "DoraJug-v1", "ppo", "affordance", 0.9, zero=0.5)
     written = write_report(tmp_path, tmp_path / "out")

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dora.agents.reports.paper import DIFFERENCES, JUG_GAIN, MEAN_GAIN, ONE_ARM, PAPER, Cell
-from dora.agents.reports.run_results import DEFAULT_PRESET, Run, grouped, zero_shares
+from dora.agents.reports.run_results import DEFAULT_PRESET, Run, grouped, zero_episodes, zero_shares
 from dora.agents.reports.statistics import Interval, aggregates, crossed_interval, mean_of_curve, paired_difference
 
 NONE = "-"
@@ -201,10 +201,10 @@ def _aggregated(cells: Mapping[Cell, list[Run]]) -> list[Section]:
 def _differences(runs: Sequence[Run]) -> Section:
     rows = []
     for (env, preset, agent, guidance, _), members in grouped(runs).items():
-        zero = _outcomes([run.zero for run in members], [run.result.get("first_seed") for run in members])
+        zero = _outcomes(zero_episodes(members), [run.result.get("first_seed") for run in members])
         ours = success_of(members)
         if zero is not None and ours is not None and zero.shape[1] == ours.shape[1]:
-            text = with_interval(*paired_difference(ours, zero[:1]), sign=True)
+            text = with_interval(*paired_difference(ours, zero), sign=True)
         elif zero_shares(members):
             text = f"{_rate(members) - 100 * mean(share for share, _ in zero_shares(members)):+.1f}"
         else:

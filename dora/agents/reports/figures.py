@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from dora.agents.reports.run_results import Group, Run, grouped, zero_shares
+from dora.agents.reports.run_results import Group, Run, grouped, zero_episodes, zero_shares
 from dora.files import write_bytes
 
 COLOURS = {
@@ -103,7 +103,7 @@ def draw_overlap(runs: Sequence[Run], env: str, preset: str, path: Path) -> None
     for group, members in grouped(runs).items():
         if group[:2] != (env, preset):
             continue
-        for tables, style in (([m.episodes for m in members], "-"), ([m.zero for m in members[:1]], ":")):
+        for tables, style in (([m.episodes for m in members], "-"), (zero_episodes(members), ":")):
             depths = [table["penetration_mm"] for table in tables if "penetration_mm" in table]
             if depths:
                 depth = np.sort(np.concatenate(depths))

@@ -121,6 +121,11 @@ def success_shares(runs: Sequence[Run]) -> list[tuple[float, int]]:
     return [(r.result["success_rate"], r.result.get("eval_episodes", 0)) for r in runs]
 
 
+def zero_episodes(runs: Sequence[Run]) -> list[dict[str, Float[np.ndarray, " z"]]]:
+    """The episodes of no correction of the first run that has them: on the same starts they are the same for all."""
+    return [run.zero for run in runs if run.zero][:1]
+
+
 def zero_shares(runs: Sequence[Run]) -> list[tuple[float, int]]:
     """The same of no correction in the runs that have a prior. Zero action on the same starts is the same episodes,
     whatever was learned, so they count once."""

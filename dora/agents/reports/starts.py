@@ -10,7 +10,7 @@ from jaxtyping import Float
 from dora.agents.evaluation.intervals import wilson
 from dora.agents.reports.comparison import Section
 from dora.agents.reports.figures import COLOURS, shortened
-from dora.agents.reports.run_results import Run, grouped
+from dora.agents.reports.run_results import Run, grouped, zero_episodes
 from dora.files import write_bytes
 
 PREFIX = "start/"
@@ -82,7 +82,7 @@ def draw_starts(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
         (joined(tables), style, members, group)
         for group, members in grouped(runs).items()
         if group[:2] == (env, preset)
-        for tables, style in (([m.episodes for m in members], "-"), ([m.zero for m in members[:1]], ":"))
+        for tables, style in (([m.episodes for m in members], "-"), (zero_episodes(members), ":"))
     ]
     names = list(dict.fromkeys(n for episodes, *_ in lines for n in filter(_is_start, episodes) if bins(episodes, n)))
     down = -(-max(len(names), 1) // ACROSS)
