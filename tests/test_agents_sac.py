@@ -1,5 +1,6 @@
 """Soft actor-critic: transitions over several steps, and what keeps a new actor at the prior."""
 
+import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -112,6 +113,27 @@ def test_prior_pulls_the_mean_towards_no_correction():
             values = learner.update(batch())
         sizes.append(values["correction"])
     assert sizes[1] < 0.3 * sizes[0]
+
+
+def test_the_pull_falls_geometrically_with_the_transitions_seen():
+    learner = small(prior=0.05, prior_last=0.0005, prior_steps=1000)
+    weights = []
+    for added in (0, 500, 1000, 5000):
+        learner.replay.added = added
+        weights.append(learner.prior)
+    assert weights == pytest.approx([0.05, 0.005, 0.0005, 0.0005])
+    assert small(prior=0.05).prior == 0.05
+    assert small(prior=0.0, prior_last=0.01).prior == 0.0  # of runs that have no prior
+
+
+def test_a_pull_that_fell_lets_the_mean_go():
+    sizes = []
+    for last in (10.0, 1e-9):
+        learner = small(critic_only=0, prior=10.0, prior_last=last, prior_steps=1, learning_rate_actor=1e-2)
+        for _ in range(3):
+            values = learner.update(batch())
+        sizes.append(values["correction"])
+    assert sizes[0] < 0.3 * sizes[1]
 
 
 def test_only_guided_runs_are_pulled_to_the_prior():

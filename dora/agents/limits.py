@@ -52,6 +52,8 @@ LEARNER = {
     "value": (0, 1e6),
     "bound": (0, 1e6),
     "prior": (0, 1e6),
+    "prior_last": (1e-12, 1e6),  # it is reached geometrically
+    "prior_steps": (1, 10**12),
     "target_entropy": (-1e6, 1e6),
     "log_std": LOGARITHM,
     "log_std_min": LOGARITHM,
