@@ -1,5 +1,7 @@
 """Soft actor-critic: transitions over several steps, and what keeps a new actor at the prior."""
 
+import pickle
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -113,6 +115,19 @@ def test_prior_pulls_the_mean_towards_no_correction():
             values = learner.update(batch())
         sizes.append(values["correction"])
     assert sizes[1] < 0.3 * sizes[0]
+
+
+def test_a_worker_gets_the_policy_alone_at_any_time():
+    """Collectors send it by pickle; what the loss keeps of its passes stays here."""
+    learner = small(critic_only=0)
+    learner.update(batch())
+    learner.update(batch())
+    assert learner.updates > 0
+    content = pickle.dumps(learner.policy)
+    policy = pickle.loads(content)
+    assert len(content) < 4 * sum(8 * p.numel() for p in learner.policy.parameters()) + 100_000
+    observation = torch.randn(3, OBSERVATION)
+    assert torch.equal(policy.greedy(observation), learner.policy.greedy(observation))
 
 
 def test_the_pull_falls_geometrically_with_the_transitions_seen():

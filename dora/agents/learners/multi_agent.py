@@ -23,7 +23,7 @@ from torchrl.objectives import ClipPPOLoss
 from dora.agents.agent_columns import Agents
 from dora.agents.config import HAPPOConfig, MAPPOConfig, PPOConfig
 from dora.agents.learners.finite import check_loss
-from dora.agents.learners.networks import Critic, GaussianActor, JointActor, Normaliser, Policy, for_loss
+from dora.agents.learners.networks import Critic, GaussianActor, JointActor, LatestOutput, Normaliser, Policy, for_loss
 from dora.agents.learners.ppo import ADAM_EPSILON, adapted, excess, squared, standardised, transitions
 
 Passes = Sequence[Int[Tensor, " b"]]
@@ -144,11 +144,11 @@ class AgentUpdate:
             functional=False,
         )
         self.optimiser = torch.optim.Adam(policy.parameters(), lr=config.learning_rate, eps=ADAM_EPSILON, fused=True)
-        self._mean = torch.empty(0)  # mean actions of the latest forward pass, for the penalty on their excess
+        self._latest = LatestOutput()  # whose mean is empty where the policy has another distribution
         actor = policy[0].module
         self._gaussian = actor if isinstance(actor, GaussianActor) else None
         if self._gaussian is not None:
-            self._gaussian.register_forward_hook(self._keep_mean)
+            self._gaussian.register_forward_hook(self._latest)
 
     @property
     def learning_rate(self) -> float:
@@ -181,8 +181,8 @@ class AgentUpdate:
     def _step(self, minibatch: TensorDict) -> Float[Tensor, " 7"]:
         """One gradient step; returns losses, the gradient's norm and the divergence."""
         out = self.loss(minibatch)
-        bound = excess(self._mean)
-        pulled = self.config.bound * bound + self.config.prior * squared(self._mean)
+        bound = excess(self._latest.mean)
+        pulled = self.config.bound * bound + self.config.prior * squared(self._latest.mean)
         total = out["loss_objective"] + out["loss_entropy"] + pulled
         parameters = list(self.policy.parameters())
         norm = _descend(self.optimiser, total, parameters, self.config.grad_norm, f"actor of {self.name}")
@@ -190,13 +190,9 @@ class AgentUpdate:
             with torch.no_grad():
                 self._gaussian.log_std.clamp_(self.config.log_std_min, 0.0)
         values = [out["loss_objective"], out["entropy"].mean(), bound, out["clip_fraction"].mean(), norm]
-        correction = self._mean.detach().square().mean().sqrt()
+        correction = self._latest.mean.detach().square().mean().sqrt()
         values += [correction.nan_to_num()]  # without a mean: it is another distribution
         return torch.stack([v.detach() for v in values] + [out["kl_approx"].detach().mean()])
-
-    def _keep_mean(self, module: nn.Module, inputs: object, outputs: tuple[Tensor, Tensor]) -> None:
-        """Forward hook: `ClipPPOLoss` hides the distribution whose mean the penalty needs."""
-        self._mean = outputs[0]
 
 
 def learn_in_order(

@@ -91,6 +91,20 @@ class Normaliser(nn.Module):
         return ((observations - self.shift) * self.scale).clamp(-CLIP, CLIP)
 
 
+class LatestOutput:
+    """Forward hook of an actor: keeps the mean and standard deviation of its latest pass, which losses hide and of
+    which penalties on the mean are made. A copy in another process begins without."""
+
+    def __init__(self):
+        self.mean, self.std = torch.empty(0), torch.empty(0)
+
+    def __call__(self, module: nn.Module, inputs: object, outputs: tuple[Tensor, Tensor]) -> None:
+        self.mean, self.std = outputs
+
+    def __reduce__(self) -> tuple[type["LatestOutput"], tuple[()]]:
+        return LatestOutput, ()
+
+
 class GaussianActor(nn.Module):
     """Mean from a network, standard deviation a parameter: the actor of PPO."""
 

@@ -11,7 +11,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from dora.agents.config import PPOConfig
 from dora.agents.learners.finite import check_loss
-from dora.agents.learners.networks import Critic, GaussianActor, Normaliser, Policy, for_loss
+from dora.agents.learners.networks import Critic, GaussianActor, LatestOutput, Normaliser, Policy, for_loss
 
 ADAM_EPSILON = 1e-8
 """Adam's epsilon, far below the gradients of values that are mean rewards."""
@@ -53,8 +53,8 @@ class PPO:
             normalize_advantage=False,
             functional=False,
         )
-        self._mean = torch.empty(0)  # mean actions of the latest forward pass
-        self.actor.register_forward_hook(self._keep_mean)
+        self._latest = LatestOutput()
+        self.actor.register_forward_hook(self._latest)
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimiser = torch.optim.Adam(parameters, lr=self.learning_rate, eps=ADAM_EPSILON, fused=True)
 
@@ -115,9 +115,9 @@ class PPO:
         """One gradient step; returns the losses, the gradient's norm and the divergence."""
         minibatch["advantage"] = standardised(minibatch["advantage"])
         out = self.loss(minibatch)
-        bound = excess(self._mean)
+        bound = excess(self._latest.mean)
         total = out["loss_objective"] + out["loss_entropy"] + out["loss_critic"]
-        total = total + self.config.bound * bound + self.config.prior * squared(self._mean)
+        total = total + self.config.bound * bound + self.config.prior * squared(self._latest.mean)
         check_loss("loss", total)
         self.optimiser.zero_grad()
         total.backward()
@@ -130,12 +130,8 @@ class PPO:
             self.actor.log_std.clamp_(self.config.log_std_min, 0.0)
         names = ("loss_objective", "loss_critic", "entropy")
         values = [out[name].mean() for name in names] + [bound, out["clip_fraction"].mean(), norm]
-        values += [self._mean.detach().square().mean().sqrt()]
+        values += [self._latest.mean.detach().square().mean().sqrt()]
         return torch.stack([v.detach() for v in values] + [out["kl_approx"].detach().mean()])
-
-    def _keep_mean(self, module: nn.Module, inputs: object, outputs: tuple[Tensor, Tensor]) -> None:
-        """Forward hook: `ClipPPOLoss` hides the distribution whose mean the bound penalty needs."""
-        self._mean = outputs[0]
 
 
 @torch.no_grad()

@@ -12,7 +12,7 @@ from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
 from dora.agents.config import SACConfig
 from dora.agents.learners.finite import check_loss
-from dora.agents.learners.networks import Critic, Normaliser, Policy, TanhActor, for_loss
+from dora.agents.learners.networks import Critic, LatestOutput, Normaliser, Policy, TanhActor, for_loss
 from dora.agents.learners.replay import Replay
 
 ACTOR_PERIOD = 2
@@ -58,8 +58,8 @@ class SAC:
             "alpha_adam": torch.optim.Adam([log_alpha], lr=config.learning_rate_alpha, fused=True),
         }
         self.replay = Replay(config.capacity, config.batch)
-        self._acted = torch.empty(0), torch.empty(0)  # mean and standard deviation of the latest forward pass
-        self.actor.register_forward_hook(self._keep_acted)
+        self._latest = LatestOutput()
+        self.actor.register_forward_hook(self._latest)
         self.updates, self.due = 0, 0.0
 
     @property
@@ -128,13 +128,9 @@ class SAC:
         log_alpha: Any = self.loss.log_alpha
         return log_alpha.detach().exp()
 
-    def _keep_acted(self, module: nn.Module, inputs: object, outputs: tuple[Tensor, Tensor]) -> None:
-        """Forward hook: `SACLoss` hides the distribution whose mean the pull towards no correction needs."""
-        self._acted = outputs
-
     def _learn_actor(self, sample: TensorDict) -> Tensor:
         loss, metadata = self.loss.actor_loss(sample)
-        mean, std = self._acted
+        mean, std = self._latest.mean, self._latest.std
         total = loss + self.prior * mean.square().sum(-1).mean()
         _descend(self.optimisers["actor_adam"], total, "loss of the actor")
         log_prob = metadata["log_prob"]
