@@ -73,6 +73,21 @@ def _make_worker_env(make_task: TaskFactory, report: Path, seed: int, stagger: b
         return WorkerTaskEnv(make_task(), report, seed=seed, stagger=stagger)
 
 
+class _Workers(MultiSyncCollector):
+    """TorchRL's collector of worker processes; one whose making fails lets go of what it had made.
+
+    Else its queues are closed only when the interpreter ends, where that waits forever for a thread that cannot start.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        try:
+            super().__init__(*args, **kwargs)
+        except BaseException:
+            for scheme in (getattr(self, "_weight_sync_schemes", None) or {}).values():
+                scheme.shutdown()
+            raise
+
+
 class Rollouts:
     """Endless source of batches (workers * num_envs, rollout) of transitions of a policy.
 
@@ -137,7 +152,7 @@ class Rollouts:
             ]
             self._collector = self._started(
                 functools.partial(
-                    MultiSyncCollector,
+                    _Workers,
                     factories,
                     self._acting,
                     frames_per_batch=workers * num_envs * rollout,
