@@ -1,0 +1,42 @@
+"""The action that undoes the error of an episode's candidate: what the best possible policy would have to find out."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dora.geometry.rotations import (
+    quaternion_apply,
+    quaternion_inverse,
+    quaternion_multiply,
+    rotation_vector_from_quaternion,
+)
+from dora.tasks.guidance.candidate_choice import CandidateChoice
+from dora.tasks.mdp.config import ResidualBounds
+
+
+def exact_correction(
+    choice: CandidateChoice, bounds: ResidualBounds, expand: Callable[[Tensor], Tensor], hand_size: int
+) -> Float[Tensor, "n a"]:
+    """The residual, in units of its bounds, with which the reference leads to the candidate as the set holds it.
+
+    The error is the same during an episode and in the object frame, and residuals are in the frame of the hand, so this
+    is one constant action. It is clipped to [-1, 1]: where it was beyond, the bounds are what stands in the way.
+
+    Args:
+        choice: candidates with their errors.
+        bounds: of the residual action.
+        expand: maps the action's hand part to all hand joints.
+        hand_size: components of that part.
+    """
+    held, b = choice.candidates, choice.buffers
+    chosen = b.chosen.long()
+    wrong = quaternion_inverse(b.quaternion[:, 0])
+    shift = quaternion_apply(wrong, held.position[chosen] - b.position[:, 0]) / bounds.position
+    turn = rotation_vector_from_quaternion(quaternion_multiply(wrong, held.quaternion[chosen])) / bounds.rotation
+    bend = (held.grasp[chosen] - b.grasp) / bounds.joint
+    unit = torch.eye(hand_size, device=bend.device)
+    effect = expand(unit) - expand(torch.zeros_like(unit))  # (action's part, joints): how a component moves the joints
+    hand = torch.linalg.lstsq(effect.T, bend.T).solution.T
+    return torch.cat([shift, turn, hand], -1).clamp(-1, 1)

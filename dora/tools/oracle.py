@@ -1,0 +1,134 @@
+"""What stands in the way of a higher success: information, the bounds of the residual action, or the learner.
+
+    python -m dora.tools.oracle DoraJug-v1 --preset hard --episodes 200
+
+Runs the same starts three times: with zero correction; with zero correction and candidates without an error, which is
+what is lost to everything but that error; and with the exact correction of that error as the action, within its bounds.
+A policy that learned cannot be expected above the second; if the third falls short of it, the bounds are too narrow; if
+a policy falls short of the third, it is the learner, or what the policy observes.
+"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+import tyro
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dora.agents.evaluation.intervals import share_text
+from dora.errors import InputError, command
+from dora.progress import ProgressDisplay
+from dora.tables import text_table
+from dora.tasks import make_task
+from dora.tasks.env.env import DoraEnv
+from dora.tasks.guidance.exact_correction import exact_correction
+from dora.tasks.mdp.guidance_parts import PRIOR
+
+BATCH = 50
+"""Episodes that run together."""
+SEED = 30_000
+"""First seed; training, evaluation and ranking use none of these."""
+HEAD = ("candidates, action", "success", "overlap not counted", "size of the action")
+"""Head of the table."""
+Act = Callable[[DoraEnv], Float[Tensor, "n a"]]
+
+
+@dataclass
+class Args:
+    """Compare zero correction, candidates without an error, and the exact correction of their error."""
+
+    env: tyro.conf.Positional[str]
+    """Task, for example DoraJug-v1."""
+    episodes: int = 200
+    """Episodes of each, rounded up to batches of 50."""
+    preset: Literal["none", "standard", "hard"] = "standard"
+    """How much episodes are randomised."""
+    pose_filter: float = 1.0
+    """Share of the newest measurement in the estimated pose of an object; 1: no filter."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of e episodes: success, success without regard to overlap, and the root mean square of the actions (1 is the
+    bound)."""
+
+    success: Bool[Tensor, " e"]
+    raw: Bool[Tensor, " e"]
+    action: float
+
+
+def no_action(task: DoraEnv) -> Float[Tensor, "n a"]:
+    """Zero correction."""
+    return torch.zeros(task.num_envs, task.action_size, device=task.device)
+
+
+def exact_action(task: DoraEnv) -> Float[Tensor, "n a"]:
+    """The exact correction of every arm, as far as the bounds allow."""
+    parts = []
+    for arm in task.arms.values():
+        bounds, expand = arm.guide.residual.bounds, arm.agent.wrist_controller.expand_hand
+        parts.append(exact_correction(arm.guide.choice, bounds, expand, arm.action_size - 6))
+    return torch.cat(parts, -1)
+
+
+def outcome(args: Args, act: Act, error: float, report: Callable[[int, int], object]) -> Outcome:
+    """Runs the episodes.
+
+    Args:
+        args: task, preset, how many.
+        act: the action of an episode, decided at its beginning.
+        error: share of the candidates' error that is in force.
+        report: is told episodes done and in all.
+
+    Raises:
+        InputError: the task has no reference to correct.
+    """
+    task = make_task(args.env, BATCH, preset=args.preset, config={"pose_filter": args.pose_filter})
+    if PRIOR not in task.parts:
+        raise InputError(f"{args.env} has no reference whose error an action could correct.")
+    task.anneal(error=error)
+    success, raw, sizes = [], [], []
+    batches = -(-args.episodes // BATCH)
+    for batch in range(batches):
+        task.reset(seed=[SEED + batch * BATCH + row for row in range(BATCH)])
+        action, failed = act(task), torch.zeros(BATCH, dtype=torch.bool)
+        sizes.append(float(action.square().mean()))
+        for _ in range(task.max_steps):
+            info = task.step(action)[-1]
+            failed |= info["fail"].cpu()
+        success.append(info["success"].cpu() & ~failed)
+        raw.append(info["raw_success"].cpu() & ~failed)
+        report((batch + 1) * BATCH, batches * BATCH)
+    task.close()
+    return Outcome(torch.cat(success), torch.cat(raw), (sum(sizes) / len(sizes)) ** 0.5)
+
+
+ROWS: tuple[tuple[str, Act, float], ...] = (
+    ("as they are, none", no_action, 1.0),
+    ("without error, none", no_action, 0.0),
+    ("as they are, the exact correction", exact_action, 1.0),
+)
+"""Names, actions, and shares of the candidates' error."""
+
+
+@command
+def main() -> None:
+    """Print the table."""
+    args = tyro.cli(Args, description=__doc__)
+    if args.episodes < 1:
+        raise InputError(f"--episodes is {args.episodes}; it has to be at least 1.")
+    rows = []
+    with ProgressDisplay() as phases:
+        for name, act, error in ROWS:
+            found = outcome(args, act, error, phases.phase(name, "episodes"))
+            shares = (share_text(float(x.float().mean()), len(x)) for x in (found.success, found.raw))
+            rows.append((name, *shares, f"{found.action:.2f}"))
+    print(f"\n{args.env}, {args.preset}, pose filter {args.pose_filter:g}:")
+    print(text_table(HEAD, rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
