@@ -25,7 +25,6 @@ from dora.agents.learners.multi_agent import AgentUpdate, MultiAgentPPO, learn_i
 from dora.agents.learners.networks import last_layer
 from dora.agents.learners.ppo import PPO
 from dora.agents.runs.logging import TAGS
-from dora.agents.runs.recommended import recommended
 from dora.agents.runs.run_folder import RunFolder
 from dora.errors import RunFailure
 
@@ -294,32 +293,6 @@ def test_time_limits_bootstrap_and_failures_do_not(ended: str, monkeypatch: pyte
     wanted = (1 - gamma) * batch["next", "reward"][:, -1] + left * gamma * following - value
     learner.update(batch)
     torch.testing.assert_close(kept[0].unflatten(0, (8, 16))[:, -1], wanted, rtol=1e-4, atol=1e-5)
-
-
-def test_the_prior_pulls_mean_actions_to_no_correction():
-    """Where the advantage tells nothing, corrections shrink with it and stay as they are without it. That agents do as
-    PPO does is shown by `test_one_agent_is_ppo`."""
-    sizes = []
-    for prior in (0.0, 0.5):
-        torch.manual_seed(0)
-        ppo = PPO(PPOConfig(**SETTINGS, prior=prior, entropy=0.0), *SIZES, 1000)
-        with torch.no_grad():
-            last_layer(ppo.actor.mean).bias.fill_(0.5)
-        batch = batch_of(ppo)
-        batch["next", "reward"] = torch.zeros_like(batch["next", "reward"])
-        with torch.no_grad():
-            last_layer(ppo.critic.net).weight.zero_()
-            last_layer(ppo.critic.net).bias.zero_()
-        sizes.append([ppo.update(batch)["correction"] for _ in range(4)][-1])
-    assert sizes[0] == pytest.approx(0.5, abs=0.02)
-    assert sizes[1] < 0.95 * sizes[0]
-
-
-def test_only_guided_runs_are_pulled():
-    learners = {"ppo": {"learner": {"prior": 0.02}}}
-    for agent in ("ppo", "happo"):
-        guided, free = (recommended("X-v1", agent, learners, guidance=name).learner for name in ("affordance", "none"))
-        assert (guided.prior, free.prior) == (0.02, 0.0)
 
 
 def test_learning_rates_are_adapted_for_each_agent():

@@ -2,7 +2,6 @@
 
 import pickle
 
-import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -128,17 +127,6 @@ def test_a_worker_gets_the_policy_alone_at_any_time():
     assert len(content) < 4 * sum(8 * p.numel() for p in learner.policy.parameters()) + 100_000
     observation = torch.randn(3, OBSERVATION)
     assert torch.equal(policy.greedy(observation), learner.policy.greedy(observation))
-
-
-def test_the_pull_falls_geometrically_with_the_transitions_seen():
-    learner = small(prior=0.05, prior_last=0.0005, prior_steps=1000)
-    weights = []
-    for added in (0, 500, 1000, 5000):
-        learner.replay.added = added
-        weights.append(learner.prior)
-    assert weights == pytest.approx([0.05, 0.005, 0.0005, 0.0005])
-    assert small(prior=0.05).prior == 0.05
-    assert small(prior=0.0, prior_last=0.01).prior == 0.0  # of runs that have no prior
 
 
 def test_a_pull_that_fell_lets_the_mean_go():

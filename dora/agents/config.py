@@ -48,6 +48,10 @@ class PPOConfig:
     prior: float = 0.0
     """Weight of the squared mean action, summed over its components: pulls towards no correction where the advantage
     does not tell actions apart, such as those of an arm that has done its part."""
+    prior_last: float | None = None
+    """That weight from `prior_steps` on, up to which it falls geometrically; None: it does not change."""
+    prior_steps: int = 100_000
+    """Environment steps after which `prior_last` is reached."""
     grad_norm: float = 1.0
     """The gradients of actor and critic are each scaled down to this norm."""
     learning_rate: float = 5e-4
@@ -126,9 +130,9 @@ class SACConfig:
 
 NEUTRAL = {"arm_effort": 1.0, "pose_filter": 1.0}
 """Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
-NEUTRAL_LEARNER = {name: {"prior": 0.0} for name in ("ppo", "mappo", "happo")} | {
-    "sac": {"prior_last": None, "prior_steps": 100_000}
-}
+CONSTANT_PULL = {"prior_last": None, "prior_steps": 100_000}
+"""Settings of a pull that does not change."""
+NEUTRAL_LEARNER = {name: {"prior": 0.0, **CONSTANT_PULL} for name in ("ppo", "mappo", "happo")} | {"sac": CONSTANT_PULL}
 """The same of settings of each learner."""
 DIGITS = 12
 """Hexadecimal digits of a digest of settings."""

@@ -25,6 +25,7 @@ from dora.agents.config import HAPPOConfig, MAPPOConfig, PPOConfig
 from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, GaussianActor, JointActor, LatestOutput, Normaliser, Policy, for_loss
 from dora.agents.learners.ppo import ADAM_EPSILON, adapted, excess, squared, standardised, transitions
+from dora.agents.learners.pull import pull
 
 Passes = Sequence[Int[Tensor, " b"]]
 """The order of the transitions in each pass over a batch; the same for all agents and the critic."""
@@ -55,6 +56,7 @@ class MultiAgentPPO:
         self.actor = JointActor(agents, config.hidden, config.log_std)
         self.critic = Critic(observation, config.hidden, nn.ELU, layer_norm=False)
         self.policy = Policy(self.normaliser, self.actor, config.noise_correlation)
+        self.steps = 0.0
         self.updates = {n: AgentUpdate(n, for_loss(self.actor.of(n), IndependentNormal), config) for n in agents}
         self.critic_adam = torch.optim.Adam(
             self.critic.parameters(), lr=config.learning_rate, eps=ADAM_EPSILON, fused=True
@@ -71,11 +73,12 @@ class MultiAgentPPO:
         return {"adam": self.critic_adam, **{f"adam_{name}": one.optimiser for name, one in self.updates.items()}}
 
     def counters(self) -> dict[str, float]:
-        """Nothing besides modules and optimisers."""
-        return {}
+        """Environment steps that were learned from."""
+        return {"steps": self.steps}
 
     def set_counters(self, counters: dict[str, float]) -> None:
         """Restore `counters`."""
+        self.steps = counters.get("steps", 0.0)  # earlier versions did not count
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Learn from a batch (N, T) and return the means of the losses by name, those of an agent as `<name>/<agent>`.
@@ -85,6 +88,9 @@ class MultiAgentPPO:
         if self.normaliser.count == 0:
             self.normaliser.update(batch["observation"])
             return {}
+        self.steps += batch.numel()
+        for one in self.updates.values():
+            one.prior = pull(self.config, self.steps)
         data = transitions(batch, self.normaliser, self.critic, self.config)
         advantage = standardised(data["advantage"])
         passes = [torch.randperm(len(data)) for _ in range(self.config.epochs)]
@@ -134,7 +140,7 @@ class AgentUpdate:
     """
 
     def __init__(self, name: str, policy: ProbabilisticTensorDictSequential, config: PPOConfig):
-        self.name, self.policy, self.config = name, policy, config
+        self.name, self.policy, self.config, self.prior = name, policy, config, config.prior
         self.loss = ClipPPOLoss(
             policy,
             None,
@@ -182,7 +188,7 @@ class AgentUpdate:
         """One gradient step; returns losses, the gradient's norm and the divergence."""
         out = self.loss(minibatch)
         bound = excess(self._latest.mean)
-        pulled = self.config.bound * bound + self.config.prior * squared(self._latest.mean)
+        pulled = self.config.bound * bound + self.prior * squared(self._latest.mean)
         total = out["loss_objective"] + out["loss_entropy"] + pulled
         parameters = list(self.policy.parameters())
         norm = _descend(self.optimiser, total, parameters, self.config.grad_norm, f"actor of {self.name}")

@@ -12,6 +12,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from dora.agents.config import PPOConfig
 from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, GaussianActor, LatestOutput, Normaliser, Policy, for_loss
+from dora.agents.learners.pull import pull
 
 ADAM_EPSILON = 1e-8
 """Adam's epsilon, far below the gradients of values that are mean rewards."""
@@ -42,7 +43,7 @@ class PPO:
         self.actor = GaussianActor(observation, action, config.hidden, config.log_std)
         self.critic = Critic(observation, config.hidden, nn.ELU, layer_norm=False)
         self.policy = Policy(self.normaliser, self.actor, config.noise_correlation)
-        self.learning_rate = config.learning_rate
+        self.learning_rate, self.steps = config.learning_rate, 0.0
         self.loss = ClipPPOLoss(
             for_loss(self.actor, IndependentNormal),
             TensorDictModule(self.critic, in_keys=["features"], out_keys=["state_value"]),
@@ -69,12 +70,13 @@ class PPO:
         return {"adam": self.optimiser}
 
     def counters(self) -> dict[str, float]:
-        """The adapted learning rate."""
-        return {"learning_rate": self.learning_rate}
+        """The adapted learning rate, and environment steps that were learned from."""
+        return {"learning_rate": self.learning_rate, "steps": self.steps}
 
     def set_counters(self, counters: dict[str, float]) -> None:
         """Restore `counters`."""
         self.set_learning_rate(counters["learning_rate"])
+        self.steps = counters.get("steps", 0.0)  # earlier versions did not count
 
     def set_learning_rate(self, value: float) -> None:
         """Use `value` from the next gradient step on."""
@@ -90,6 +92,7 @@ class PPO:
         if self.normaliser.count == 0:
             self.normaliser.update(batch["observation"])
             return {}
+        self.steps += batch.numel()
         data = transitions(batch, self.normaliser, self.critic, self.config)
         losses: list[Tensor] = []
         divergences: list[Tensor] = []
@@ -117,7 +120,7 @@ class PPO:
         out = self.loss(minibatch)
         bound = excess(self._latest.mean)
         total = out["loss_objective"] + out["loss_entropy"] + out["loss_critic"]
-        total = total + self.config.bound * bound + self.config.prior * squared(self._latest.mean)
+        total = total + self.config.bound * bound + pull(self.config, self.steps) * squared(self._latest.mean)
         check_loss("loss", total)
         self.optimiser.zero_grad()
         total.backward()

@@ -13,6 +13,7 @@ from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 from dora.agents.config import SACConfig
 from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, LatestOutput, Normaliser, Policy, TanhActor, for_loss
+from dora.agents.learners.pull import pull
 from dora.agents.learners.replay import Replay
 
 ACTOR_PERIOD = 2
@@ -70,11 +71,7 @@ class SAC:
     @property
     def prior(self) -> float:
         """Weight of the pull towards no correction at this moment."""
-        c = self.config
-        if c.prior_last is None or c.prior == 0:
-            return c.prior
-        share = min(self.replay.added / c.prior_steps, 1.0)
-        return c.prior * (c.prior_last / c.prior) ** share
+        return pull(self.config, float(self.replay.added))
 
     def counters(self) -> dict[str, float]:
         """Gradient steps taken and due, transitions seen."""

@@ -1,0 +1,61 @@
+"""The pull of mean actions towards no correction, over the course of a run."""
+
+import pytest
+import torch
+from test_agents_multi import SETTINGS, SIZES, batch_of, learner_of
+
+from dora.agents.config import PPOConfig, SACConfig
+from dora.agents.learners.networks import last_layer
+from dora.agents.learners.ppo import PPO
+from dora.agents.learners.pull import pull
+from dora.agents.runs.recommended import recommended
+
+
+def test_it_falls_geometrically_with_the_steps():
+    config = SACConfig(prior=0.05, prior_last=0.0005, prior_steps=1000)
+    assert [pull(config, steps) for steps in (0.0, 500.0, 1000.0, 5000.0)] == pytest.approx([0.05, 0.005, 0.0005, 0.0005])
+    assert pull(SACConfig(prior=0.05), 5000.0) == 0.05
+    assert pull(SACConfig(prior=0.0, prior_last=0.01), 0.0) == 0.0  # of runs that have no prior
+
+
+def test_the_prior_pulls_mean_actions_to_no_correction():
+    """Where the advantage tells nothing, corrections shrink with it and stay as they are without it. That agents do as
+    PPO does is shown by `test_one_agent_is_ppo`."""
+    sizes = []
+    for prior in (0.0, 0.5):
+        torch.manual_seed(0)
+        ppo = PPO(PPOConfig(**SETTINGS, prior=prior, entropy=0.0), *SIZES, 1000)
+        with torch.no_grad():
+            last_layer(ppo.actor.mean).bias.fill_(0.5)
+        batch = batch_of(ppo)
+        batch["next", "reward"] = torch.zeros_like(batch["next", "reward"])
+        with torch.no_grad():
+            last_layer(ppo.critic.net).weight.zero_()
+            last_layer(ppo.critic.net).bias.zero_()
+        sizes.append([ppo.update(batch)["correction"] for _ in range(4)][-1])
+    assert sizes[0] == pytest.approx(0.5, abs=0.02)
+    assert sizes[1] < 0.95 * sizes[0]
+
+
+def test_the_pull_of_ppo_and_of_each_agent_falls_with_the_steps_and_is_resumed():
+    settings = {**SETTINGS, "prior": 0.02, "prior_last": 0.0002, "prior_steps": 1}
+    ppo = PPO(PPOConfig(**settings), *SIZES, 1000)
+    batch = batch_of(ppo)
+    ppo.update(batch)
+    assert ppo.counters()["steps"] == batch.numel()
+    learner = learner_of(**settings)
+    assert {one.prior for one in learner.updates.values()} == {0.02}
+    learner.update(batch_of(learner))
+    assert [one.prior for one in learner.updates.values()] == pytest.approx([0.0002] * 2)
+    other = learner_of(**settings)
+    other.set_counters(learner.counters())
+    assert other.steps == learner.steps == batch.numel()
+    other.set_counters({})  # of a version that did not count
+    assert other.steps == 0
+
+
+def test_only_guided_runs_are_pulled():
+    learners = {"ppo": {"learner": {"prior": 0.02}}}
+    for agent in ("ppo", "happo"):
+        guided, free = (recommended("X-v1", agent, learners, guidance=name).learner for name in ("affordance", "none"))
+        assert (guided.prior, free.prior) == (0.02, 0.0)
