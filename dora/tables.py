@@ -1,4 +1,5 @@
-"""Tables as Markdown, HTML pages and text on a terminal: by jinja2, which escapes what comes from files, and rich."""
+"""Tables as Markdown, HTML pages and text on a terminal, by jinja2, which escapes what comes from files, and rich; and
+shares of trials with their intervals."""
 
 import html
 import io
@@ -12,6 +13,8 @@ from rich.table import Table
 
 MARKS = "\\`*_{}[]~$"
 """Characters within a line that Markdown may read as marks; bars are escaped by tables."""
+CONFIDENCE = 0.95
+"""Probability with which an interval covers the true share [1]."""
 _PLAIN, _ESCAPED = jinja2.Environment(), jinja2.Environment(autoescape=True)
 """Templates of text, and of pages in which values are escaped."""
 _MARKDOWN = _PLAIN.from_string("""\
@@ -65,3 +68,19 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], table: Table) -> 
     for row in rows:
         table.add_row(*row)
     return table
+
+
+def wilson(hits: int, trials: int) -> tuple[float, float]:
+    """Wilson's interval of a share `hits` / `trials` (E. B. Wilson 1927); (0, 1) without trials."""
+    from scipy.stats import binomtest  # half a second, for commands that print no share
+
+    if trials == 0:
+        return 0.0, 1.0
+    interval = binomtest(hits, trials).proportion_ci(CONFIDENCE, "wilson")
+    return float(interval.low), float(interval.high)
+
+
+def share_text(share: float, trials: int, scale: float = 1.0, digits: int = 3) -> str:
+    """A share with its interval, such as "0.875 [0.822, 0.914]"; `scale` 100 gives percent."""
+    low, high = wilson(round(share * trials), trials)
+    return f"{scale * share:.{digits}f} [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"

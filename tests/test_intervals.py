@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from dora.agents.evaluation.intervals import share_text, wilson
+from dora.tables import share_text, wilson
 
 Z = 1.959963984540054  # 97.5 % quantile of the normal distribution
 

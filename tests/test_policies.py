@@ -16,13 +16,13 @@ import dora
 from dora.agents.checkpoint import read_checkpoint
 from dora.agents.collecting.task_env import EpisodeColumns
 from dora.agents.evaluation.evaluate import Evaluation
-from dora.agents.evaluation.intervals import wilson
 from dora.agents.reports.run_results import find_runs
 from dora.errors import InputError
 from dora.policies import bundle
 from dora.policies.bundle import PAGE, cards_table, check_agrees, chosen, is_bundled, make_card
 from dora.policies.card import Card, failure_causes
 from dora.policies.policy import bundled_files, bundled_ids, load_policy
+from dora.tables import wilson
 from dora.tasks import task_ids
 
 ROOT = Path(__file__).parents[1]

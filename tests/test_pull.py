@@ -13,7 +13,9 @@ from dora.agents.runs.recommended import recommended
 
 def test_it_falls_geometrically_with_the_steps():
     config = SACConfig(prior=0.05, prior_last=0.0005, prior_steps=1000)
-    assert [pull(config, steps) for steps in (0.0, 500.0, 1000.0, 5000.0)] == pytest.approx([0.05, 0.005, 0.0005, 0.0005])
+    assert [pull(config, steps) for steps in (0.0, 500.0, 1000.0, 5000.0)] == pytest.approx(
+        [0.05, 0.005, 0.0005, 0.0005]
+    )
     assert pull(SACConfig(prior=0.05), 5000.0) == 0.05
     assert pull(SACConfig(prior=0.0, prior_last=0.01), 0.0) == 0.0  # of runs that have no prior
 
@@ -39,10 +41,18 @@ def test_the_prior_pulls_mean_actions_to_no_correction():
 
 def test_the_pull_of_ppo_and_of_each_agent_falls_with_the_steps_and_is_resumed():
     settings = {**SETTINGS, "prior": 0.02, "prior_last": 0.0002, "prior_steps": 1}
-    ppo = PPO(PPOConfig(**settings), *SIZES, 1000)
-    batch = batch_of(ppo)
-    ppo.update(batch)
-    assert ppo.counters()["steps"] == batch.numel()
+    means = []
+    for last in (0.0002, 2.0):
+        torch.manual_seed(0)
+        ppo = PPO(PPOConfig(**{**settings, "prior_last": last}), *SIZES, 1000)
+        batch = batch_of(ppo)
+        ppo.update(batch)
+        assert ppo.counters()["steps"] == batch.numel()
+        means.append(ppo.update(batch)["correction"])
+    assert means[1] < 0.9 * means[0]
+    again = PPO(PPOConfig(**settings), *SIZES, 1000)
+    again.set_counters(ppo.counters())
+    assert again.steps == ppo.steps
     learner = learner_of(**settings)
     assert {one.prior for one in learner.updates.values()} == {0.02}
     learner.update(batch_of(learner))

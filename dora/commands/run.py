@@ -240,7 +240,7 @@ def evaluate_only(args: Args) -> Path:
         checkpoint, evaluation, zero = evaluate_checkpoint(path, *settings, **options)
         progress = {name: checkpoint.progress.get(name, value) for name, value in progress.items()}
         print(outcome(evaluation, zero), file=sys.stderr)
-    folder.write_evaluation(evaluation)
+    folder.write_evaluation(evaluation, zero if path else None)
     result = make_result(config, evaluation=evaluation, zero=zero, finished=True, **progress)
     folder.write_result(result | {"agent": agent, "checkpoint": None if path is None else str(path)})
     return folder.path

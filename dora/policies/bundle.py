@@ -18,7 +18,6 @@ import tyro
 from dora.agents.checkpoint import Checkpoint, read_checkpoint
 from dora.agents.config import RunConfig
 from dora.agents.evaluation.evaluate import FINAL_SEED, Evaluation
-from dora.agents.evaluation.intervals import wilson
 from dora.agents.evaluation.play import evaluate_checkpoint
 from dora.agents.reports.run_results import DEFAULT_PRESET, Run, find_runs
 from dora.configs import plain
@@ -26,7 +25,7 @@ from dora.errors import InputError, command
 from dora.files import make_folder, write_bytes
 from dora.policies.card import HEADINGS, SECONDS_PER_MINUTE, Card, failure_causes
 from dora.policies.policy import bundled_files, bundled_ids
-from dora.tables import markdown_table
+from dora.tables import markdown_table, wilson
 from dora.tasks import find_task, make_task, task_ids
 from dora.tasks.env.options import task_config
 from dora.tools.task_pages import refreshed

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from dora.agents.evaluation.evaluate import Evaluation
-from dora.agents.evaluation.intervals import share_text
 from dora.configs import built, check_finite, plain
 from dora.errors import InputError
 from dora.files import write_json
 from dora.reading import read_json
-from dora.tables import text_table
+from dora.tables import share_text, text_table
 
 MOST = 100_000
 """Size of a card above which it is not read [bytes]."""

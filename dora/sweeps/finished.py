@@ -6,6 +6,7 @@ from pathlib import Path
 from statistics import mean
 
 from dora.agents.runs.stored_results import read_result
+from dora.errors import InputError
 from dora.sweeps.plan import Row
 
 EXPECTED = {"DoraCube-v1": 1.1e-3, "DoraJug-v1": 1.9e-3, "DoraHammer-v1": 3.4e-3, "DoraMicrowave-v1": 3.3e-3}
@@ -39,16 +40,25 @@ class Finished:
     success_rate: float
 
 
-def finished_runs(folders: Iterable[Path]) -> list[Finished]:
-    """The finished runs under some folders that were trained, not only evaluated again.
+def finished_runs(folders: Iterable[Path], strict: bool = True) -> list[Finished]:
+    """The finished runs under some folders that were trained, not only evaluated.
+
+    Args:
+        folders: with run folders in them.
+        strict: refuse a damaged result.json; else it is no finished run.
 
     Raises:
         InputError: a result.json is damaged.
     """
     found = []
     for path in sorted({path for folder in folders for path in folder.rglob("result.json")}):
-        result = read_result(path)
-        if result is None or result.get("checkpoint"):
+        try:
+            result = read_result(path)
+        except InputError:
+            if strict:
+                raise
+            continue
+        if result is None or result.get("checkpoint") or not result["env_steps"]:
             continue
         found.append(
             Finished(
@@ -61,9 +71,9 @@ def finished_runs(folders: Iterable[Path]) -> list[Finished]:
 
 
 def result_of(row: Row, found: Sequence[Finished]) -> Finished | None:
-    """A finished run with the settings and at least the budget of a run of the sweep."""
+    """A finished run with the settings and the budget of a run of the sweep."""
     digests = row.digests
-    fitting = (one for one in found if one.digest in digests and one.budget >= row.config.total_steps)
+    fitting = (one for one in found if one.digest in digests and one.budget == row.config.total_steps)
     return next(fitting, None)
 
 

@@ -7,9 +7,10 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from dora.agents.config import RunConfig
 from dora.agents.runs.run_folder import RunFolder
 from dora.agents.runs.stored_results import read_result
 from dora.errors import InputError
@@ -19,8 +20,8 @@ LOG = "output.log"
 """What a run of a sweep has printed, in its folder."""
 TAIL = 4096
 """Characters at the end of a file that are looked at [bytes]."""
-ELSEWHERE = "another process trains in it"
-"""Why a run is not begun when its folder is locked."""
+NOT_THE_RUN = "it has ended, and is not the run that is wanted"
+"""Complaint about a finished run whose settings or budget are others."""
 
 Command = Callable[[Path], Sequence[str]]
 """Words of the process that begins or goes on with the run in a folder."""
@@ -47,22 +48,34 @@ def resuming(folder: Path) -> list[str]:
     return [sys.executable, "-m", "dora", "run", "--resume", str(folder)]
 
 
-def prepare(row: Row, folder: Path) -> None:
-    """Make the folder of a run with its settings, unless it is there.
+def check_folder(row: Row, folder: Path) -> RunConfig | None:
+    """The settings of the run that a folder holds; None if there is none yet.
 
     Raises:
-        InputError: the folder holds a run with other settings, or cannot be written.
+        InputError: they are damaged, or others than those of the run.
     """
-    run = RunFolder(folder)
     if not (folder / "config.yaml").exists():
-        run.create(row.config)
-        return
-    stored = run.read_config()
+        return None
+    stored = RunFolder(folder).read_config()
     if stored.digest() != row.config.digest():
         raise InputError(
             f"{folder} holds a run with other settings (of another version of the task or of the learner): "
             "move it away, or choose another --out."
         )
+    return stored
+
+
+def prepare(row: Row, folder: Path) -> None:
+    """Make the folder of a run with its settings, unless it is there; one of a smaller budget gets the larger one.
+
+    Raises:
+        InputError: the folder holds a run with other settings, or cannot be written.
+    """
+    run, stored = RunFolder(folder), check_folder(row, folder)
+    if stored is None:
+        run.create(row.config)
+    elif stored.total_steps < row.config.total_steps:
+        run.write_config(replace(stored, total_steps=row.config.total_steps))
 
 
 def is_finished(folder: Path) -> bool:

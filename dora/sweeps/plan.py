@@ -134,7 +134,7 @@ def rows_of(
     if preset not in PRESETS:
         raise InputError(f"There is no sweep {preset!r}: use one of {', '.join(PRESETS)}.")
     plan, rows = PRESETS[preset], list[Row]()
-    for seed, block in itertools.product(seeds or plan.seeds, plan.blocks):
+    for seed, block in itertools.product(dict.fromkeys(seeds or plan.seeds), plan.blocks):
         for (env, budget), agent, kind in itertools.product(block.budgets.items(), block.agents, block.guidance):
             config = settings(env, agent, kind, seed, total_steps or budget, episodes or plan.episodes)
             rows.append(Row(block.title, config))

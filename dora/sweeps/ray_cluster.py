@@ -23,7 +23,7 @@ from dora.sweeps.launching import LOG, Command, Launcher, complaint, is_finished
 from dora.sweeps.plan import WORKERS, Row
 
 SENT = (
-    "config.yaml", "versions.txt", "result.json", "curve.csv", "progress.csv", "eval.csv", LOG,
+    "config.yaml", "versions.txt", "result.json", "curve.csv", "progress.csv", "eval.csv", "zero.csv", LOG,
     "checkpoints/best.safetensors",
 )  # fmt: skip
 """Files of a finished run that are sent back."""
@@ -59,7 +59,11 @@ class RayLauncher(Launcher):
         except (ConnectionError, ValueError, RuntimeError) as error:
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             raise InputError(f"No Ray cluster answers at {address or 'this machine'} ({reason}).") from error
-        self.room = max(int(self._ray.cluster_resources().get("CPU", 0) // cores), 1)
+        nodes = [node["Resources"].get("CPU", 0) for node in self._ray.nodes() if node["Alive"]]
+        self.room = sum(int(cpus // cores) for cpus in nodes)
+        if self.room == 0:
+            self._ray.shutdown()
+            raise InputError(f"A run takes {cores} cores, and no machine of the Ray cluster has so many.")
         self._train = self._ray.remote(num_cpus=cores, max_retries=RETRIES)(train_there)
         self._command = command
         self._running: dict[Any, tuple[Row, Path]] = {}

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 
+from dora.errors import InputError
 from dora.sweeps.finished import Finished, finished_runs, result_of, seconds_per_step
-from dora.sweeps.launching import Launcher, is_finished, is_locked, prepare, progress_of
+from dora.sweeps.launching import NOT_THE_RUN, Launcher, check_folder, is_finished, is_locked, prepare, progress_of
 from dora.sweeps.plan import Row
 
 POLL_SECONDS = 1.0
@@ -81,13 +82,13 @@ class Sweep:
     entries: list[Entry] = field(init=False)
 
     def __post_init__(self) -> None:
-        found = self._found()
+        found = self._found(strict=True)
         self.entries = [Entry(row, self.out / row.name, rate=seconds_per_step(row, found)) for row in self.rows]
         for entry in self.entries:
             self._settle(entry, found)
 
-    def _found(self) -> list[Finished]:
-        return finished_runs(folder for folder in (self.out, *self.known) if folder.is_dir())
+    def _found(self, strict: bool = False) -> list[Finished]:
+        return finished_runs((folder for folder in (self.out, *self.known) if folder.is_dir()), strict)
 
     @property
     def seconds_left(self) -> float:
@@ -107,9 +108,14 @@ class Sweep:
             tell: called in every turn, to show how it stands.
             check: called in every turn; what it raises ends the sweep, when the runs have saved their states.
 
+        A run whose folder turns out to be unusable later on has failed; the others go on.
+
         Raises:
-            InputError: the folder of a run cannot be used.
+            InputError: the folder of a run holds another one; nothing has been trained then.
         """
+        for entry in self.entries:
+            if entry.state is State.WAITING:
+                check_folder(entry.row, entry.folder)
         try:
             while self.count(State.DONE) + self.count(State.FAILED) < len(self.entries):
                 check()
@@ -127,8 +133,12 @@ class Sweep:
         entry = next(entry for entry in self.entries if entry.row is row)
         if complaint is None:
             self._settle(entry, self._found())
+            if entry.state is State.DONE:
+                return
+        elif is_locked(entry.folder):  # another process was there first, and trains in it
+            entry.state, entry.tries = State.ELSEWHERE, entry.tries - 1
             return
-        entry.complaint = complaint
+        entry.complaint = complaint or NOT_THE_RUN
         entry.state = State.WAITING if entry.tries <= self.retries else State.FAILED
 
     def _look_elsewhere(self) -> None:
@@ -147,9 +157,13 @@ class Sweep:
             if self.count(State.RUNNING) + self.count(State.ELSEWHERE) >= self.jobs:
                 return
             if entry.state is State.WAITING:
-                prepare(entry.row, entry.folder)
-                entry.state, entry.tries = State.RUNNING, entry.tries + 1
-                launcher.start(entry.row, entry.folder)
+                try:
+                    prepare(entry.row, entry.folder)
+                    launcher.start(entry.row, entry.folder)
+                except (InputError, OSError) as error:  # its folder is no good; the others may be
+                    entry.state, entry.complaint = State.FAILED, str(error)
+                else:
+                    entry.state, entry.tries = State.RUNNING, entry.tries + 1
 
     def _settle(self, entry: Entry, found: Sequence[Finished]) -> None:
         """Notes the result of a run, if there is one."""

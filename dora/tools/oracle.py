@@ -18,10 +18,9 @@ import tyro
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dora.agents.evaluation.intervals import share_text
 from dora.errors import InputError, command
 from dora.progress import ProgressDisplay
-from dora.tables import text_table
+from dora.tables import share_text, text_table
 from dora.tasks import make_task
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.guidance.exact_correction import exact_correction

@@ -10,8 +10,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from dora.agents.collecting.task_env import EpisodeColumns, TaskEnv
-from dora.agents.evaluation.intervals import share_text, wilson
 from dora.errors import InputError
+from dora.tables import share_text, wilson
 
 PERIODIC_SEED = 1_000_000_000
 """Seed of the first episode of evaluations during training; all training seeds are smaller."""

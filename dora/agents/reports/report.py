@@ -6,14 +6,13 @@ from pathlib import Path
 from statistics import mean, stdev
 from urllib.parse import quote
 
-from dora.agents.evaluation.intervals import share_text
 from dora.agents.reports.comparison import OVERLAP, Section, sections
 from dora.agents.reports.figures import SECONDS_PER_MINUTE, draw_curves, draw_overlap
 from dora.agents.reports.run_results import DEFAULT_PRESET, Run, find_runs, grouped, success_shares, zero_shares
 from dora.agents.reports.starts import draw_starts, has_starts, starts_section
 from dora.digests import digest_of
 from dora.files import make_folder, write_bytes
-from dora.tables import html_page, markdown_table, markdown_text
+from dora.tables import html_page, markdown_table, markdown_text, share_text
 
 LONGEST_FILE = 180
 """Largest number of characters of the name of a figure, without its ending [1]."""

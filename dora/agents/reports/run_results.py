@@ -128,11 +128,11 @@ def zero_episodes(runs: Sequence[Run]) -> list[dict[str, Float[np.ndarray, " z"]
 
 def zero_shares(runs: Sequence[Run]) -> list[tuple[float, int]]:
     """The same of no correction in the runs that have a prior. Zero action on the same starts is the same episodes,
-    whatever was learned, so they count once."""
-    found: dict[tuple[Any, ...], tuple[float, int]] = {}
+    whatever was learned, so those that begin with the same start count once: the longest evaluation."""
+    found: dict[int, tuple[float, int]] = {}
     for run in runs:
         r = run.result
-        if r["zero_success_rate"] is not None:
-            starts = r.get("first_seed", FINAL_SEED), r.get("eval_episodes", 0), r["zero_success_rate"]
-            found[starts] = r["zero_success_rate"], r.get("eval_episodes", 0)
+        first, share = r.get("first_seed", FINAL_SEED), (r["zero_success_rate"], r.get("eval_episodes", 0))
+        if share[0] is not None and share[1] >= found.get(first, (0.0, -1))[1]:
+            found[first] = share
     return list(found.values())

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from dora.agents.evaluation.intervals import wilson
 from dora.agents.reports.comparison import Section
 from dora.agents.reports.figures import COLOURS, shortened
 from dora.agents.reports.run_results import Run, grouped, zero_episodes
 from dora.files import write_bytes
+from dora.tables import wilson
 
 PREFIX = "start/"
 """Of the columns of an eval.csv that say how its episode began."""
