@@ -16,7 +16,7 @@ from fake_task import PointMass
 
 import dora.agents
 from dora.agents.checkpoint import read_checkpoint
-from dora.agents.config import LEARNER_CONFIGS, NEUTRAL, config_from_dict, stored_digests
+from dora.agents.config import LEARNER_CONFIGS, NEUTRAL, NEUTRAL_LEARNER, config_from_dict, stored_digests
 from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed
 from dora.agents.evaluation.play import load_policy
 from dora.agents.runs.recommended import learners_of, recommended
@@ -280,7 +280,8 @@ def test_settings_without_a_reward_mean_the_dense_one_and_keep_their_digest():
     del content["total_steps"]
     whole = digest_of(content)[:12]
     assert {name: content["task"].pop(name) for name in NEUTRAL} == NEUTRAL
-    assert content["learner"].pop("prior") == 0.0
+    neutral = NEUTRAL_LEARNER["ppo"]
+    assert {name: content["learner"].pop(name) for name in neutral} == neutral
     assert config.digest() == digest_of(content)[:12] == stored_digests(content)[0]
     assert whole in stored_digests(plain(config))
     weaker = dataclasses.replace(config, task=config.task | {"arm_effort": 0.5})

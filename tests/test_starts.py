@@ -113,7 +113,8 @@ def test_a_report_shows_success_against_the_start(tmp_path: Path):
         write_run(tmp_path / "runs" / str(seed), seed, 0.5, episodes=40)
         _write_episodes(tmp_path / "runs" / str(seed) / "eval.csv", error < 3.9, error)
     _write_episodes(tmp_path / "runs" / "0" / "zero.csv", error < 2, error)
-    write_run(tmp_path / "runs" / "old", 3, 0.5, "none")  # whose episodes do not say
+    write_run(tmp_path / "runs" / "old", 3, 0.5, episodes=40)  # whose episodes do not say
+    (tmp_path / "runs" / "old" / "eval.csv").write_text("episode,success\n0,1\n1,0\n")
     section = starts_section(find_runs(tmp_path / "runs"))
     assert [row[4] for row in section.rows] == ["candidate_error_mm"]  # the size is the same everywhere
     assert [cell.split()[0] for cell in section.rows[0][5:]] == ["100.0", "100.0", "0.0", "0.0"]

@@ -8,7 +8,18 @@ from urllib.parse import quote
 
 from dora.agents.reports.comparison import OVERLAP, Section, sections
 from dora.agents.reports.figures import SECONDS_PER_MINUTE, draw_curves, draw_overlap
-from dora.agents.reports.run_results import DEFAULT_PRESET, Run, find_runs, grouped, success_shares, zero_shares
+from dora.agents.reports.run_results import (
+    ALONE,
+    DEFAULT_PRESET,
+    SHARED,
+    UNKNOWN,
+    Run,
+    find_runs,
+    grouped,
+    shared_mark,
+    success_shares,
+    zero_shares,
+)
 from dora.agents.reports.starts import draw_starts, has_starts, starts_section
 from dora.digests import digest_of
 from dora.files import make_folder, write_bytes
@@ -52,10 +63,6 @@ img{max-width:100%}h2{margin-top:2em}</style>
 {%- endfor %}
 """
 """Template of `report.html`, which needs no other file."""
-ALONE = 0.1
-"""Cores that other programs may keep busy, on average, while a run counts as alone on its machine [1]."""
-SHARED, UNKNOWN = " \N{DAGGER}", " ?"
-"""Marks of minutes beside other programs, and of minutes of which that was not measured."""
 NOTE = (
     "In brackets Wilson's 95 % interval over the evaluation episodes of all seeds, which does not hold how much seeds "
     "differ. Episodes of zero correction on the same starts are the same and count once. Other columns: mean and "
@@ -88,14 +95,6 @@ def pooled(shares: Sequence[tuple[float, int]]) -> str:
     return share_text(sum(share * n for share, n in shares) / trials, trials, scale=100.0, digits=1)
 
 
-def _shared_mark(runs: Sequence[Run]) -> str:
-    """The mark of minutes that were not measured on a machine of their own, or of which that is not known."""
-    loads = [run.result.get("other_load") for run in runs]
-    if any(load is not None and load > ALONE for load in loads):
-        return SHARED
-    return UNKNOWN if None in loads else ""
-
-
 def table_rows(runs: Sequence[Run]) -> list[list[str]]:
     """Cells under `HEADINGS`: one row per group of runs (`Run.group`), success over the episodes of all seeds."""
     rows = []
@@ -107,7 +106,7 @@ def table_rows(runs: Sequence[Run]) -> list[list[str]]:
             pooled(zero_shares(members)),
             _spread([m.result["penetration_p95_mm"] for m in members]),
             f"{thousands}k",
-            _spread([m.result["wall_seconds"] / SECONDS_PER_MINUTE for m in members]) + _shared_mark(members),
+            _spread([m.result["wall_seconds"] / SECONDS_PER_MINUTE for m in members]) + shared_mark(members),
         ])  # fmt: skip
     return rows
 

@@ -2,14 +2,14 @@
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from dora.agents.config import NEUTRAL
+from dora.agents.config import NEUTRAL, NEUTRAL_LEARNER
 from dora.agents.evaluation.evaluate import FINAL_SEED
 from dora.agents.runs.progress_table import read_progress
 from dora.agents.runs.stored_results import read_curve, read_episodes, read_result
@@ -17,6 +17,11 @@ from dora.errors import InputError
 
 DEFAULT_PRESET = "standard"
 """Preset of a run of a Dora task that names none."""
+
+ALONE = 0.1
+"""Cores that other programs may keep busy, on average, while a run counts as alone on its machine [1]."""
+SHARED, UNKNOWN = " \N{DAGGER}", " ?"
+"""Marks of minutes beside other programs, and of minutes of which that was not measured."""
 
 Group = tuple[str, str, str, str, int]
 """Environment, preset, agent, guidance, steps in thousands (rounded): what the runs of one row of the table share."""
@@ -70,7 +75,37 @@ def find_runs(root: Path) -> list[Run]:
             runs.append(Run(path.parent, result, rows, trained, episodes, zero))
     if not runs:
         raise InputError(f"there is no finished run under {root}: point at a folder with result.json files in it.")
-    return runs
+    return _with_zero(_once(runs))
+
+
+def _once(runs: Sequence[Run]) -> list[Run]:
+    """The runs without copies of them in other folders."""
+    found: dict[tuple[Any, ...], Run] = {}
+    for run in runs:
+        r = run.result
+        key = run.group, r["seed"], r.get("config_digest"), r["env_steps"], r["wall_seconds"], r["success_rate"]
+        found.setdefault((*key, r.get("first_seed"), r.get("checkpoint")), run)
+    return list(found.values())
+
+
+def _with_zero(runs: Sequence[Run]) -> list[Run]:
+    """The runs, with the zero correction of another one where they did not measure it: on the same starts of the same
+    task it is the same, whatever was learned."""
+
+    def starts(run: Run) -> tuple[Any, ...]:
+        r = run.result
+        first = r.get("first_seed", FINAL_SEED), r.get("eval_episodes", 0)
+        return r["env"], run.group[1], run.group[3], str(sorted(_flat(NEUTRAL | (r.get("task_config") or {})))), *first
+
+    measured = {starts(run): run for run in runs if run.result["zero_success_rate"] is not None}
+    filled = []
+    for run in runs:
+        other = measured.get(starts(run))
+        if other is not None and run.result["zero_success_rate"] is None:
+            share = {"zero_success_rate": other.result["zero_success_rate"]}
+            run = replace(run, result=run.result | share, zero=other.zero)
+        filled.append(run)
+    return filled
 
 
 def _episodes(path: Path) -> dict[str, Float[np.ndarray, " e"]]:
@@ -92,7 +127,10 @@ def grouped(runs: Sequence[Run]) -> dict[Group, list[Run]]:
 
 def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Runs by what the numbers of their task differ in, in words: by switches alone where these tell them apart."""
-    numbers = [dict(_flat(NEUTRAL | (run.result.get("task_config") or {}))) for run in runs]
+    known = all("learner_config" in run.result for run in runs)  # results of earlier versions lack it
+    numbers = [
+        dict(_flat(NEUTRAL | (run.result.get("task_config") or {}))) | (_learner(run) if known else {}) for run in runs
+    ]
     names = sorted({name for each in numbers for name in each})
     different = [name for name in names if len({str(each.get(name)) for each in numbers}) > 1]
     switches = [name for name in different if isinstance(numbers[0].get(name), bool | str)]
@@ -105,6 +143,12 @@ def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
         words = zip(switches if enough else different, values, strict=True)
         found["".join(f", {name} {value}" for name, value in words)].append(run)
     return found
+
+
+def _learner(run: Run) -> dict[str, Any]:
+    """Settings of the learner by name."""
+    settings = NEUTRAL_LEARNER.get(run.result["agent"], {}) | (run.result["learner_config"] or {})
+    return {f"learner.{name}": value for name, value in settings.items()}
 
 
 def _flat(numbers: dict[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
@@ -136,3 +180,11 @@ def zero_shares(runs: Sequence[Run]) -> list[tuple[float, int]]:
         if share[0] is not None and share[1] >= found.get(first, (0.0, -1))[1]:
             found[first] = share
     return list(found.values())
+
+
+def shared_mark(runs: Sequence[Run]) -> str:
+    """The mark of minutes that were not measured on a machine of their own, or of which that is not known."""
+    loads = [run.result.get("other_load") for run in runs]
+    if any(load is not None and load > ALONE for load in loads):
+        return SHARED
+    return UNKNOWN if None in loads else ""

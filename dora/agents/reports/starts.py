@@ -20,7 +20,7 @@ PARTS = 4
 ACROSS = 3
 """Pictures in a row of the figure [1]."""
 
-Episodes = Mapping[str, Float[np.ndarray, " e"]]
+Episodes = Mapping[str, Float[np.ndarray, " _"]]
 """Columns of an eval.csv, or of those of several seeds, one after the other."""
 Bin = tuple[float, float, int, int]
 """Lowest and highest value of a number, episodes, successes."""
@@ -41,8 +41,9 @@ def bins(episodes: Episodes, name: str) -> list[Bin]:
     return [(values[p].min(), values[p].max(), len(p), round(success[p].sum())) for p in parts]
 
 
-def joined(tables: Sequence[Episodes]) -> dict[str, Float[np.ndarray, " all"]]:
-    """The columns that all tables have, one table after the other."""
+def joined(tables: Sequence[Episodes]) -> dict[str, Float[np.ndarray, " _"]]:
+    """The columns that all tables have, one table after the other; tables without numbers of the start are left out."""
+    tables = [table for table in tables if any(map(_is_start, table))]
     names = [name for name in tables[0] if all(name in table for table in tables)] if tables else []
     return {name: np.concatenate([table[name] for table in tables]) for name in names}
 

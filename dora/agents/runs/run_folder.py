@@ -222,6 +222,7 @@ def make_result(
         "seed": config.seed,
         "commit": source_commit(),
         "task_config": config.task,
+        "learner_config": plain(config.learner),
         "env_steps": env_steps,
         "wall_seconds": round(wall_seconds, 3),
         "env_steps_per_second": round(rate, 1),
