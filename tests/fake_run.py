@@ -50,6 +50,8 @@ def main(folder: Path, mode: str, result: str) -> int:
         if interrupted:
             return 130
         time.sleep(SECONDS if mode == "slow" else 0.0)
+    for name in ("eval.csv", "zero.csv"):
+        (folder / name).write_text("episode,success\n0,1\n")
     (folder / "half").write_text(result)
     (folder / "half").rename(folder / "result.json")
     return 0

@@ -83,8 +83,12 @@ def test_batches_are_those_of_processes(ahead: bool):
 
 
 def test_what_a_worker_says_arrives():
-    with rollouts(learner().policy, Drifting, cluster=True) as source, pytest.raises(InputError, match="3 is NaN"):
+    with (
+        rollouts(learner().policy, Drifting, cluster=True) as source,
+        pytest.raises(InputError, match="3 is NaN") as caught,
+    ):
         source.collect()
+    assert "\n" not in str(caught.value)
 
 
 def test_a_worker_that_dies_is_told():

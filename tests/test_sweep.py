@@ -272,7 +272,7 @@ def test_a_machine_that_does_not_see_the_folder_sends_the_files(tmp_path: Path, 
     here = tmp_path / "here"
     settings = ray_cluster.plain(row.config)
     files = ray_cluster.train_there(str(here), "no-marker", settings, lambda folder: fake_words(folder, "well"))
-    assert set(files) == {"config.yaml", "versions.txt", "result.json", "progress.csv", LOG}
+    assert set(files) == {"config.yaml", "versions.txt", "result.json", "progress.csv", "eval.csv", "zero.csv", LOG}
     here.mkdir()
     ray_cluster.receive(here, files)
     assert states(Sweep([row], tmp_path, [here])) == [State.DONE]

@@ -248,11 +248,11 @@ class Rollouts:
         """Replace TorchRL's "a process failed" by what the worker said, or by how it ended."""
         try:
             yield
-        except (RunFailure, InputError):
-            raise
         except Exception as error:
-            if (failure := explained(error)) is not None:
+            if (failure := explained(error)) is not None:  # Ray's errors are of the worker's class, too
                 raise failure from error
+            if isinstance(error, RunFailure | InputError):
+                raise
             for index, report in enumerate(self._reports):
                 if report.exists():
                     kind, _, message = report.read_text().partition("\n")

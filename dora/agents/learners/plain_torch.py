@@ -84,7 +84,7 @@ class PlainPPO:
     def _step(self, part: Batch) -> Tensor:
         c = self.config
         advantage = part["advantage"]
-        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        advantage = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
         mean, std = self.actor(part["features"])
         distribution = torch.distributions.Normal(mean, std)
         log_ratio = distribution.log_prob(part["action"]).sum(-1) - part["log_prob"]

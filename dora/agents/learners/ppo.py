@@ -168,7 +168,7 @@ def transitions(batch: TensorDictBase, normaliser: Normaliser, critic: Critic, c
 
 def standardised(advantage: Float[Tensor, "b 1"]) -> Float[Tensor, "b 1"]:
     """Advantages with mean 0 and deviation 1."""
-    return (advantage - advantage.mean()) / (advantage.std() + ADVANTAGE_FLOOR)
+    return (advantage - advantage.mean()) / (advantage.std(correction=0) + ADVANTAGE_FLOOR)
 
 
 def excess(mean: Float[Tensor, "*b a"]) -> Float[Tensor, ""]:

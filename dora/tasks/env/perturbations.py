@@ -83,13 +83,15 @@ class Perturbations:
 
     def begin(self, rows: Int[Tensor, " b"], share: Float[Tensor, " b"]) -> None:
         """Starts new episodes in the environments `rows`; `share` in [0, 1) chooses their keys."""
-        self.buffers.write(rows, key=(share * KEYS).floor(), **{f"{arm}_count": 0.0 for arm in self._filtered})
+        counts = {f"{arm}_count": 0.0 for arm in self._filtered}
+        self.buffers.write(rows, key=(share * KEYS).floor(), waiting=0.0, **counts)
 
     def _draws(self, step: Tensor, start: int, size: int) -> Tensor:
         return uniform(self.buffers.key.long(), step.long(), start + size)[:, start:]
 
     def delayed(self, action: Float[Tensor, "n a"], step: Int[Tensor, " n"]) -> Float[Tensor, "n a"]:
-        """Takes in the action of a control step; the one that takes effect now. The first acts at once."""
+        """Takes in the action of a control step; the one that takes effect now. The action of an episode's first step
+        acts at once; one that comes later, after steps without any, follows actions of zero."""
         if self.randomisation.delay == 0:
             return action
         waiting = self.buffers.waiting

@@ -1,0 +1,100 @@
+"""Sweeps that meet what they cannot use: other budgets, evaluations, broken folders, other processes, full disks."""
+
+import fcntl
+import os
+from pathlib import Path
+
+import pytest
+from test_sweep import fake, few, nothing, result, starts, states
+
+import dora.sweeps.sweep
+from dora.agents.runs.run_folder import RunFolder
+from dora.sweeps.launching import NOT_THE_RUN, LocalLauncher, prepare
+from dora.sweeps.plan import rows_of
+from dora.sweeps.sweep import State, Sweep
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(dora.sweeps.sweep, "POLL_SECONDS", 0.05)
+
+
+def short_rows(steps: int):
+    return rows_of("paper", envs=["DoraCube-v1"], agents=["ppo"], guidance=["affordance"], seeds=[0], total_steps=steps)
+
+
+def test_a_run_of_a_smaller_budget_is_gone_on_with_up_to_the_larger_one(tmp_path: Path):
+    Sweep(short_rows(1000), tmp_path).run(fake("well"), nothing, nothing)
+    sweep = Sweep(short_rows(2000), tmp_path)
+    assert states(sweep) == [State.WAITING]
+    sweep.run(fake("well"), nothing, nothing)
+    assert states(sweep) == [State.DONE]
+    assert starts(sweep) == [2]
+    assert RunFolder(sweep.entries[0].folder).read_config().total_steps == 2000
+
+
+def test_a_run_of_a_larger_budget_is_another_one(tmp_path: Path):
+    (row,) = short_rows(1000)
+    result(row, tmp_path / "known" / "long", total_steps=2000)
+    assert states(Sweep([row], tmp_path / "out", [tmp_path / "known"])) == [State.WAITING]
+
+
+def test_an_evaluation_of_zero_correction_is_no_trained_run(tmp_path: Path):
+    (row,) = short_rows(1000)
+    result(row, tmp_path / "known" / "zero", agent="zero", env_steps=0, checkpoint=None)
+    assert states(Sweep([row], tmp_path / "out", [tmp_path / "known"])) == [State.WAITING]
+
+
+def test_a_run_that_ends_as_another_one_has_failed(tmp_path: Path):
+    """It must not stay `running` for good."""
+    (row,) = short_rows(1000)
+    prepare(row, tmp_path / row.name)
+    words = fake("well").command(tmp_path / row.name)
+    wrong = [*words[:-1], words[-1].replace(row.config.digest(), "0" * 12)]
+    sweep = Sweep([row], tmp_path)
+    sweep.run(LocalLauncher(lambda folder: wrong), nothing, nothing)
+    assert states(sweep) == [State.FAILED]
+    assert sweep.entries[0].complaint == NOT_THE_RUN
+
+
+def test_a_disk_that_fills_up_fails_one_run_and_not_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    rows = few(3)
+
+    def full(row, folder):
+        if row is rows[1]:
+            raise OSError(28, "No space left on device", str(folder))
+        prepare(row, folder)
+
+    monkeypatch.setattr(dora.sweeps.sweep, "prepare", full)
+    sweep = Sweep(rows, tmp_path)
+    sweep.run(fake("well"), nothing, nothing)
+    assert states(sweep) == [State.DONE, State.FAILED, State.DONE]
+    assert "No space left" in sweep.entries[1].complaint
+
+
+def test_a_result_that_is_damaged_meanwhile_does_not_end_the_sweep(tmp_path: Path):
+    rows = few(2)
+    sweep = Sweep(rows, tmp_path)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "result.json").write_text("{")
+    sweep.run(fake("well"), nothing, nothing)
+    assert states(sweep) == [State.DONE, State.DONE]
+
+
+def test_the_same_seed_twice_is_one_run(tmp_path: Path):
+    rows = rows_of("paper", envs=["DoraCube-v1"], agents=["ppo"], guidance=["affordance"], seeds=[10, 10])
+    assert len(rows) == 1
+
+
+def test_who_comes_second_waits_for_the_process_that_trains_in_a_folder(tmp_path: Path):
+    (row,) = few(1)
+    prepare(row, tmp_path / row.name)
+    sweep = Sweep([row], tmp_path, retries=0)
+    lock = os.open(tmp_path / row.name / ".lock", os.O_RDWR | os.O_CREAT)
+    sweep.entries[0].state, sweep.entries[0].tries = State.RUNNING, 1
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    sweep._note_end(row, "status 1: another process trains in it")
+    assert states(sweep) == [State.ELSEWHERE]
+    os.close(lock)
+    sweep.run(fake("well"), nothing, nothing)
+    assert states(sweep) == [State.DONE]
