@@ -108,6 +108,8 @@ class JugConfig(TaskConfig):
     fewest_lifts: float = 0.5
     """Smallest share of its executions that a ranked candidate must have survived to be used, as a share of the best
     candidate's [1]."""
+    pose_filter: float = 0.15
+    """Share of the newest measurement in the estimated pose of the jug, for policy and reference; 1: no filter."""
     most_candidates: int = 12
     """Stored candidates that the task works with [1]."""
     reference: GraspSettings = field(default_factory=lambda: replace(GraspSettings(), hover=0.06))
@@ -141,7 +143,7 @@ class JugTask(Task):
     LEARNERS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "sac": {
             "total_steps": 300_000, "stop_success": 0.98, "num_envs": 32, "eval_every": 50_000, "eval_episodes": 100,
-            "eval_envs": 50,
+            "eval_envs": 50, "learner": {"prior": 0.01, "noise_correlation": 0.9},
         },
         "ppo": {
             "total_steps": 600_000, "stop_success": 0.98, "num_envs": 64, "eval_every": 60_000, "eval_episodes": 100,
