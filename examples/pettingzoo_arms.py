@@ -1,6 +1,6 @@
 """PettingZoo plays the arms of a task as agents: `python examples/pettingzoo_arms.py`.
 
-Needs PettingZoo: `pip install 'dora-manipulation[pettingzoo]'`.
+Needs PettingZoo: `pip install -e '.[pettingzoo]'`.
 """
 
 import argparse

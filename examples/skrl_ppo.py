@@ -1,6 +1,6 @@
 """PPO of skrl learns to lift a cube: `python examples/skrl_ppo.py --steps 100000`.
 
-Needs skrl: `pip install 'dora-manipulation[skrl]'`.
+Needs skrl: `pip install -e '.[skrl]'`.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """PPO of Stable-Baselines3 learns to lift a cube: `python examples/stable_baselines.py --steps 300000`.
 
-Needs Stable-Baselines3: `pip install 'dora-manipulation[sb3]'`.
+Needs Stable-Baselines3: `pip install -e '.[sb3]'`.
 """
 
 import argparse

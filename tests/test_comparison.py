@@ -119,7 +119,7 @@ def test_without_rliable_a_report_says_what_is_missing(tmp_path: Path, monkeypat
 
     monkeypatch.setattr(statistics.importlib, "import_module", missing)
     whole(tmp_path)
-    assert table(tmp_path, "Over tasks") == [["needs rliable: pip install 'dora-manipulation[report]'"]]
+    assert table(tmp_path, "Over tasks") == [["needs rliable: pip install rliable 'pandas<3'"]]
 
 
 # ------------------------------------------------------------------- sections

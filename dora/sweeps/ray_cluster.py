@@ -53,7 +53,7 @@ class RayLauncher(Launcher):
         try:
             self._ray: Any = importlib.import_module("ray")
         except ImportError as error:
-            raise InputError("--launcher ray needs Ray: pip install 'dora-manipulation[ray]'.") from error
+            raise InputError("--launcher ray needs Ray: pip install ray.") from error
         try:
             self._ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
         except (ConnectionError, ValueError, RuntimeError) as error:

@@ -46,7 +46,7 @@ def ray_collector(make_task: TaskFactory, policy: Policy, *, frames: int, seeds:
         ray: Any = importlib.import_module("ray")
         from torchrl.collectors.distributed import RayCollector
     except ImportError as error:
-        raise InputError("--collector ray needs Ray: pip install 'dora-manipulation[ray]'.") from error
+        raise InputError("--collector ray needs Ray: pip install ray.") from error
     try:
         if not ray.is_initialized():
             ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR")

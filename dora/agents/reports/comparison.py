@@ -267,7 +267,7 @@ def _aggregated(cells: Mapping[Cell, list[Run]]) -> list[Section]:
                 scores[f"{agent}, {guidance}"] = np.array(shares).T
     found = aggregates(scores) if scores else {}
     if found is None:
-        return [Section("Over tasks 1 to 3", ("",), [["needs rliable: pip install 'dora-manipulation[report]'"]])]
+        return [Section("Over tasks 1 to 3", ("",), [["needs rliable: pip install rliable 'pandas<3'"]])]
     rows = [[name, str(len(scores[name])), *(with_interval(*pair) for pair in both)] for name, both in found.items()]
     head = ("learner, guidance", "seeds", "mean %", "interquartile mean %")
     return [Section("Over tasks 1 to 3", head, rows, "By rliable, stratified bootstrap over seeds.")]

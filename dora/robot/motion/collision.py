@@ -48,7 +48,7 @@ def need(module: str, package: str) -> ModuleType:
         return import_module(module)
     except ImportError as error:
         raise InputError(
-            f"motion planning needs the package {package!r}: install it with pip install 'dora[plan]'."
+            f"motion planning needs the package {package!r}: in a checkout of Dora, pip install -e '.[plan]'."
         ) from error
 
 
