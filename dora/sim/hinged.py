@@ -9,7 +9,7 @@ with the angular velocity w; damping is the joint's own.
 """
 
 from collections.abc import Mapping
-from math import prod
+from math import prod, tanh
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,7 @@ class HingedObject:
 
     def __init__(self, scene: ManiSkillScene, obj: AffordanceObject, mount: Mount):
         self.mount, self._device = mount, torch.device(scene.device)
+        self._latch_angle = mount.hinge.latch_angle
         self.articulation: Articulation = _build(scene, obj, mount)
         self.links: dict[str, Link] = {link.name: self.articulation.links_map[link.name] for link in mount.links}
         self._bodies = list(self.articulation._objs)
@@ -96,9 +97,9 @@ class HingedObject:
     def _resist(self, i: int) -> None:
         """Sets the torque of friction and latch in environment i for its next physics step."""
         body = self._bodies[i]
-        torque = -self.resistance["friction"][i] * np.tanh(float(body.qvel[0]) / FRICTION_SPEED)
-        if float(body.qpos[0]) < self.mount.hinge.latch_angle:
-            torque -= self.resistance["latch"][i]
+        torque = -float(self.resistance["friction"][i]) * tanh(float(body.qvel[0]) / FRICTION_SPEED)
+        if float(body.qpos[0]) < self._latch_angle:
+            torque -= float(self.resistance["latch"][i])
         body.set_qf(np.array([torque], np.float32))
 
     def get_state(self) -> dict[str, Tensor]:

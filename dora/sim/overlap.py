@@ -37,12 +37,12 @@ class OverlapMonitor:
     def _watch(self, environment: int, contacts: list) -> None:
         lowest = self._lowest[environment]
         for contact in contacts:
-            separation = min([point.separation for point in contact.points], default=0.0)
-            if separation < lowest:
-                one, other = contact.bodies
-                if id(one) in self._watched or id(other) in self._watched:
-                    self._lowest[environment] = lowest = separation
-                    self._names[environment] = (one.entity.name, other.entity.name)
+            for point in contact.points:  # most are not the deepest, so that nothing else is asked of them
+                if point.separation < lowest:
+                    one, other = contact.bodies
+                    if id(one) in self._watched or id(other) in self._watched:
+                        self._lowest[environment] = lowest = point.separation
+                        self._names[environment] = (one.entity.name, other.entity.name)
 
     def _drop(self, environment: int) -> None:
         self._lowest[environment], self._names[environment] = 0.0, None

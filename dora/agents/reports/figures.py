@@ -139,9 +139,9 @@ def _draw_evaluations(axes: Any, groups: dict[Group, list[Run]]) -> dict[Group, 
     views = ((*by_steps, "success_rate"), (*by_minutes, "success_rate"), (*by_steps, "return_mean"))
     for axis, (x, unit, y) in zip(axes, views, strict=True):
         for group, members in groups.items():
-            length = min(len(m.curve) for m in members)
-            values = [[m.curve[i][y] for m in members] for i in range(length)]
-            at = [mean(m.curve[i][x] for m in members) / unit for i in range(length)]
+            length = max(len(m.curve) for m in members)  # a run that was good enough early keeps its last value
+            values = [[m.curve[min(i, len(m.curve) - 1)][y] for m in members] for i in range(length)]
+            at = [mean(m.curve[i][x] for m in members if i < len(m.curve)) / unit for i in range(length)]
             label = f"{shortened(group[2])}, guidance {shortened(group[3])}, {group[4]}k ({len(members)})"
             colour = colours.get(group, COLOURS.get(group[2:4]))
             (line,) = axis.plot(at, [mean(v) for v in values], color=colour, marker="o", markersize=3, label=label)
