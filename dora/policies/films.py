@@ -1,6 +1,6 @@
 """Films of the policies that come with the tasks: `python -m dora.policies.films`.
 
-Writes <task>.gif, three episodes on consecutive seeds whether they succeed or not, and <task>-film.png, moments of the
+Writes <task>.gif, up to three episodes on consecutive seeds whether they succeed or not, and <task>-film.png, moments of the
 first of them, to docs/images, and says which episodes succeeded. Needs a Vulkan driver (docs/rendering.md).
 """
 
@@ -32,6 +32,8 @@ SIDE = 200
 """Width and height of a film [pixels]."""
 RATE = 10.0
 """Pictures of a film in a second [1/s]."""
+MOST_PICTURES = 300
+"""Pictures of a film: of long episodes there are fewer than were asked for, at least one [1]."""
 COLOURS = 96
 """Number of colours of a film."""
 MOMENTS = 8
@@ -84,8 +86,13 @@ def _small(frame: UInt8[np.ndarray, "_ _ 3"]) -> Picture:
 
 
 def as_gif(episodes: list[Episode]) -> bytes:
-    """A film of all episodes with one palette."""
-    frames = [frame for episode in episodes for frame in episode.pictures[:: max(round(episode.rate / RATE), 1)]]
+    """A film of the episodes with one palette, of as many of them as `MOST_PICTURES` allows."""
+    frames: list[Picture] = []
+    for episode in episodes:
+        some = episode.pictures[:: max(round(episode.rate / RATE), 1)]
+        if frames and len(frames) + len(some) > MOST_PICTURES:
+            break
+        frames += some
     some = np.concatenate(frames[:: max(len(frames) // 12, 1)])
     palette = Image.fromarray(some).quantize(COLOURS, dither=Image.Dither.NONE)
     pictures = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
