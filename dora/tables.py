@@ -1,5 +1,7 @@
-"""Tables as Markdown, HTML pages and text on a terminal, by jinja2, which escapes what comes from files, and rich; and
-shares of trials with their intervals."""
+"""Tables as Markdown, HTML pages and text on a terminal, and shares of trials with their intervals.
+
+Jinja2 escapes what comes from files; rich draws on terminals.
+"""
 
 import html
 import io

@@ -1,5 +1,7 @@
 """The exact correction of a candidate's error, and the tool that runs episodes with it."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -56,6 +58,15 @@ def test_without_an_error_there_is_nothing_to_correct(task):
 
 
 def test_the_tool_runs_the_same_starts_with_each(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    begun, make = [], oracle.make_task
+
+    def noted(*args: Any, **options: Any) -> Any:
+        task = make(*args, **options)
+        reset = task.reset
+        task.reset = lambda seed: (reset(seed=seed), begun.append(task.objects["cube"].pose.p.clone()))
+        return task
+
+    monkeypatch.setattr(oracle, "make_task", noted)
     monkeypatch.setattr(oracle, "BATCH", 2)
     monkeypatch.setattr("sys.argv", ["oracle", "DoraCube-v1", "--episodes", "2", "--preset", "hard"])
     oracle.main()
@@ -65,6 +76,9 @@ def test_the_tool_runs_the_same_starts_with_each(monkeypatch: pytest.MonkeyPatch
     sizes = [float(line.split()[-1]) for line in lines[-3:]]
     assert sizes[:2] == [0.0, 0.0]
     assert sizes[2] > 0.1
+    assert len(begun) == 3
+    assert torch.equal(begun[0], begun[1])
+    assert torch.equal(begun[0], begun[2])
 
 
 def test_no_episodes_are_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
