@@ -1,7 +1,7 @@
 """Films of the policies that come with the tasks: `python -m dora.policies.films`.
 
-Writes <task>.gif, up to three episodes on consecutive seeds whether they succeed or not, and <task>-film.png, moments of the
-first of them, to docs/images, and says which episodes succeeded. Needs a Vulkan driver (docs/rendering.md).
+Writes <task>.gif, up to three episodes on consecutive seeds whether they succeed or not, and <task>-film.png, moments
+of the first of them, to docs/images, and says which episodes succeeded. Needs a Vulkan driver (docs/rendering.md).
 """
 
 from __future__ import annotations

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from dora.tables import wilson
+
 SAMPLES = 2000
 """Samples of a bootstrap [1]."""
 SEED = 0
@@ -21,13 +23,16 @@ Interval = tuple[float, float]
 
 def crossed_interval(outcomes: Float[np.ndarray, "seeds starts"]) -> Interval:
     """Bootstrap interval of the mean over seeds and starts, both drawn with replacement: a start that is hard is hard
-    for every seed, so episodes are not independent. With one seed, over starts alone.
+    for every seed, so episodes are not independent. With one seed, over starts alone. Where all episodes end
+    alike there is nothing to draw from, and the interval is Wilson's over the starts.
 
     Args:
         outcomes: of each seed in the episode of each start.
     """
     generator = np.random.default_rng(SEED)
     seeds, starts = outcomes.shape
+    if np.ptp(outcomes) == 0:
+        return wilson(round(starts * float(outcomes.flat[0])), starts)
     means = [
         outcomes[np.ix_(generator.integers(seeds, size=seeds), generator.integers(starts, size=starts))].mean()
         for _ in range(SAMPLES)
