@@ -45,8 +45,8 @@ class Args:
     """Episodes of each, rounded up to batches of 50."""
     preset: Literal["none", "standard", "hard"] = "standard"
     """How much episodes are randomised."""
-    pose_filter: float = 1.0
-    """Share of the newest measurement in the estimated pose of an object; 1: no filter."""
+    pose_filter: float | None = None
+    """Share of the newest measurement in the estimated pose of an object, 1: no filter; the task's own if not given."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,8 @@ def outcome(args: Args, act: Act, error: float, report: Callable[[int, int], obj
     Raises:
         InputError: the task has no reference to correct.
     """
-    task = make_task(args.env, BATCH, preset=args.preset, config={"pose_filter": args.pose_filter})
+    changed = {} if args.pose_filter is None else {"pose_filter": args.pose_filter}
+    task = make_task(args.env, BATCH, preset=args.preset, config=changed)
     if PRIOR not in task.parts:
         raise InputError(f"{args.env} has no reference whose error an action could correct.")
     task.anneal(error=error)
@@ -125,7 +126,8 @@ def main() -> None:
             found = outcome(args, act, error, phases.phase(name, "episodes"))
             shares = (share_text(float(x.float().mean()), len(x)) for x in (found.success, found.raw))
             rows.append((name, *shares, f"{found.action:.2f}"))
-    print(f"\n{args.env}, {args.preset}, pose filter {args.pose_filter:g}:")
+    about = "" if args.pose_filter is None else f", pose filter {args.pose_filter:g}"
+    print(f"\n{args.env}, {args.preset}{about}:")
     print(text_table(HEAD, rows))
 
 
