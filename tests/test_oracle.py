@@ -57,6 +57,7 @@ def test_without_an_error_there_is_nothing_to_correct(task):
     task.anneal(error=1.0)
 
 
+@pytest.mark.slow
 def test_the_tool_runs_the_same_starts_with_each(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     begun, make = [], oracle.make_task
 
