@@ -64,6 +64,16 @@ def test_the_pull_of_ppo_and_of_each_agent_falls_with_the_steps_and_is_resumed()
     assert other.steps == 0
 
 
+def test_a_preset_may_have_settings_of_its_own():
+    learners = {"sac": {"eval_envs": 7, "learner": {"gamma": 0.9}, "presets": {"hard": {"learner": {"prior": 0.01}}}}}
+    usual, hard = (recommended("X-v1", "sac", learners, preset=name) for name in (None, "hard"))
+    assert (usual.learner.prior, hard.learner.prior) == (0.05, 0.01)
+    assert (usual.learner.gamma, hard.learner.gamma, hard.eval_envs, hard.preset) == (0.9, 0.9, 7, "hard")
+    given = recommended("X-v1", "sac", learners, preset="hard", learner={"prior": 0.2})
+    assert given.learner.prior == 0.2
+    assert recommended("X-v1", "sac", learners, preset="hard", guidance="none").learner.prior == 0.0
+
+
 def test_only_guided_runs_are_pulled():
     learners = {"ppo": {"learner": {"prior": 0.02}}}
     for agent in ("ppo", "happo"):

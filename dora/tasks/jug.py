@@ -143,7 +143,7 @@ class JugTask(Task):
     LEARNERS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "sac": {
             "total_steps": 300_000, "stop_success": 0.98, "num_envs": 32, "eval_every": 50_000, "eval_episodes": 100,
-            "eval_envs": 50, "learner": {"prior": 0.01, "noise_correlation": 0.9},
+            "eval_envs": 50, "presets": {"hard": {"learner": {"prior": 0.01, "noise_correlation": 0.9}}},
         },
         "ppo": {
             "total_steps": 600_000, "stop_success": 0.98, "num_envs": 64, "eval_every": 60_000, "eval_episodes": 100,

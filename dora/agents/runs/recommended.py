@@ -36,7 +36,7 @@ def recommended(
         env: task id.
         agent: learner; the task's first one if None.
         learners: the learners that can do the task, with differences from the defaults of `RunConfig` and, under
-            `learner`, from those of the learner.
+            `learner`, from those of the learner; under `presets` further ones by preset.
         overrides: fields of `RunConfig`; `learner` is a mapping of fields of the learner's settings.
 
     Raises:
@@ -47,7 +47,9 @@ def recommended(
     if agent not in learners:
         raise InputError(f"{env} cannot be learned by {agent!r}: use --agent with one of {', '.join(learners)}.")
     fields: dict[str, Any] = {"workers": available_cores(), **learners[agent]}
+    own = fields.pop("presets", {}).get(overrides.get("preset") or RunConfig.preset, {})
     learner, given = dict(fields.pop("learner", {})), overrides.pop("learner", None) or {}
+    fields, learner = fields | {n: v for n, v in own.items() if n != "learner"}, learner | own.get("learner", {})
     fields |= {name: value for name, value in overrides.items() if value is not None}
     config: RunConfig = RunConfig(env=env, agent=agent, **fields)
     learner |= {} if config.has_prior else WITHOUT_PRIOR.get(agent, {})
