@@ -186,7 +186,7 @@ def test_a_restored_episode_goes_on_with_its_estimate():
 
 def test_no_action_of_an_episode_takes_effect_in_the_next():
     late = Perturbations(Randomisation(delay=1), 2, 1, {"arm": 20}, 0.05, CPU)
-    late.delayed(torch.full((2, 1), 0.7), torch.zeros(2))
+    late.delayed(torch.full((2, 1), 0.7), torch.zeros(2, dtype=torch.long))
     late.begin(torch.tensor([1]), torch.tensor([0.5]))
     done = late.delayed(torch.full((2, 1), 0.2), torch.tensor([1, 1]))  # a first step without an action came before
     assert done[:, 0].tolist() == pytest.approx([0.7, 0.0])

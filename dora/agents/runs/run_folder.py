@@ -222,7 +222,6 @@ def make_result(
         "seed": config.seed,
         "commit": source_commit(),
         "task_config": config.task,
-        "learner_config": plain(config.learner),
         "env_steps": env_steps,
         "wall_seconds": round(wall_seconds, 3),
         "env_steps_per_second": round(rate, 1),
@@ -250,6 +249,7 @@ def make_result(
         "total_steps": config.total_steps,
         "first_seed": some.first_seed if some else None,
         "other_load": other_seconds / wall_seconds if other_seconds is not None and wall_seconds > 0 else None,
+        "learner_config": plain(config.learner),
     }
 
 
