@@ -163,3 +163,24 @@ def test_no_runs_and_damaged_ones_are_refused(tmp_path: Path):
     (tmp_path / "result.json").write_text("{")
     with pytest.raises(InputError, match="damaged"):
         find_runs(tmp_path)
+
+
+@pytest.mark.parametrize("entry", [{"learner_config": [1]}, {"task_config": "x"}, {"seed": [1]}, {"config_digest": {}}])
+def test_an_entry_of_another_type_is_named(tmp_path: Path, entry: dict[str, object]):
+    for name in ("a", "b"):
+        write_run(tmp_path / name, 0, 0.5)
+        path = tmp_path / name / "result.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | entry))
+    with pytest.raises(InputError, match=rf"result\.json is damaged \({next(iter(entry))} is"):
+        write_report(tmp_path, tmp_path / "out")
+
+
+def test_results_without_a_seed_are_reported(tmp_path: Path):
+    for name in ("a", "b"):
+        write_run(tmp_path / name, 0, 0.5 if name == "a" else 0.6)
+        path = tmp_path / name / "result.json"
+        content = json.loads(path.read_text())
+        del content["seed"]
+        path.write_text(json.dumps(content))
+    write_report(tmp_path, tmp_path / "out")
+    assert "| 2 |" in (tmp_path / "out" / "tables.md").read_text()

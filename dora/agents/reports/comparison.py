@@ -202,7 +202,7 @@ def _claims(cells: Mapping[Cell, list[Run]]) -> Section:
         ]
         if missing:
             return [claim, paper, NONE, f"runs are missing: {', '.join(missing)}"]
-        fewest = min(len({run.result["seed"] for run in cells[cell]}) for cell in needed)
+        fewest = min(len({run.result.get("seed") for run in cells[cell]}) for cell in needed)
         if fewest < FEWEST:
             return [claim, paper, ours, f"too few runs: {fewest} of {FEWEST} seeds"]
         sure = abs(margin) > NORMAL * error if np.isfinite(error) else True
@@ -258,10 +258,10 @@ def _aggregated(cells: Mapping[Cell, list[Run]]) -> list[Section]:
     for agent in ("PPO", "SAC"):
         for guidance in ("affordance", "none"):
             rates = [
-                {run.result["seed"]: run.result["success_rate"] for run in cells.get((env, agent, guidance), [])}
+                {run.result.get("seed"): run.result["success_rate"] for run in cells.get((env, agent, guidance), [])}
                 for env in ONE_ARM
             ]
-            common = sorted(set.intersection(*map(set, rates)))
+            common = sorted(set.intersection(*map(set, rates)), key=str)
             if len(common) >= 2:
                 shares = [[one[seed] for seed in common] for one in rates]
                 scores[f"{agent}, {guidance}"] = np.array(shares).T

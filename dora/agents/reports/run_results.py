@@ -83,7 +83,7 @@ def _once(runs: Sequence[Run]) -> list[Run]:
     found: dict[tuple[Any, ...], Run] = {}
     for run in runs:
         r = run.result
-        key = run.group, r["seed"], r.get("config_digest"), r["env_steps"], r["wall_seconds"], r["success_rate"]
+        key = run.group, r.get("seed"), r.get("config_digest"), r["env_steps"], r["wall_seconds"], r["success_rate"]
         found.setdefault((*key, r.get("first_seed"), r.get("checkpoint")), run)
     return list(found.values())
 

@@ -29,7 +29,8 @@ OPTIONAL = {
     "preset": "text", "guidance_parts": "texts or none", "reward": "text", "checkpoint": "text or none",
     "eval_episodes": "count", "total_steps": "count", "first_seed": "count or none", "task": "mapping",
     "other_load": "number or none", "raw_success_rate": "share or none", "steps_to_80": "count or none",
-    "stage_rates": "shares",
+    "stage_rates": "shares", "seed": "count", "task_config": "mapping or none", "learner_config": "mapping or none",
+    "config_digest": "text",
 }  # fmt: skip
 """The same of entries that results of some versions have."""
 NESTED = {"preset": "text", "guidance_parts": "texts or none"}
