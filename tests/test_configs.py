@@ -14,6 +14,7 @@ from dora.tasks import find_task, make_task, task_ids
 from dora.tasks.cube import CubeConfig
 from dora.tasks.env.options import task_config
 from dora.tasks.hammer.task import HammerConfig
+from dora.tasks.jug import JugConfig
 from dora.tasks.mdp.randomisation import PRESETS
 from dora.tools import describe
 
@@ -116,6 +117,15 @@ def test_the_preset_is_the_randomisation_that_can_be_overridden(env_id: str):
     changed = task_config(cls, "hard", {"randomisation": {"push": 0.5}}).randomisation
     assert (changed.push, changed.delay) == (0.5, PRESETS["hard"].delay)
     assert changed == replace(cls.PRESETS["hard"], push=0.5)
+
+
+def test_a_preset_brings_other_numbers_of_a_task_too():
+    shares = {preset: task_config(JugConfig, preset, None).pose_filter for preset in JugConfig.PRESETS}
+    assert shares == {"none": 1.0, "standard": 1.0, "hard": 0.15}
+    assert task_config(JugConfig, "hard", {"pose_filter": 0.3}).pose_filter == 0.3
+    task = make_task("DoraJug-v1", 2, preset="hard")
+    assert task.config.pose_filter == 0.15
+    task.close()
 
 
 @pytest.mark.parametrize(

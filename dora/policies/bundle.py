@@ -107,7 +107,7 @@ def is_usual(config: RunConfig) -> bool:
         return False
     cls = find_task(config.env).CONFIG
     own, theirs = (plain(task_config(cls, config.preset, numbers)) for numbers in (None, config.task))
-    switches = [name for name, value in own.items() if isinstance(value, bool | str)]
+    switches = [name for name, value in own.items() if isinstance(value, bool | str)] + ["pose_filter"]
     return config.preset == DEFAULT_PRESET and all(own[name] == theirs[name] for name in switches)
 
 

@@ -79,6 +79,8 @@ class JugWeights(PenaltyWeights):
 class JugConfig(TaskConfig):
     """Numbers of the task."""
 
+    BY_PRESET: ClassVar[Mapping[str, Mapping[str, Any]]] = {"hard": {"pose_filter": 0.15}}
+
     mass: tuple[float, float] = (0.30, 0.60)
     """Mass of the empty and of the full jug [kg]."""
     centre: tuple[float, float] = (0.55, 0.0)
@@ -108,8 +110,6 @@ class JugConfig(TaskConfig):
     fewest_lifts: float = 0.5
     """Smallest share of its executions that a ranked candidate must have survived to be used, as a share of the best
     candidate's [1]."""
-    pose_filter: float = 0.15
-    """Share of the newest measurement in the estimated pose of the jug, for policy and reference; 1: no filter."""
     most_candidates: int = 12
     """Stored candidates that the task works with [1]."""
     reference: GraspSettings = field(default_factory=lambda: replace(GraspSettings(), hover=0.06))

@@ -44,13 +44,14 @@ class TaskOptions:
 
 
 def task_config(cls: type[TaskConfig], preset: str, changes: Any) -> TaskConfig:
-    """The numbers of a task: its own, the preset's randomisation, then `changes`.
+    """The numbers of a task: its own, those of the preset (randomisation and `BY_PRESET`), then `changes`.
 
     Raises:
         InputError: for an unknown preset, an unknown name, a value of the wrong type, a number that is not finite or
             negative where it is a size, time, speed or count, or rates that do not fit.
     """
-    base: TaskConfig = replace(cls(), randomisation=find_preset(preset, cls.PRESETS))
+    randomisation = find_preset(preset, cls.PRESETS)
+    base: TaskConfig = replace(cls(), randomisation=randomisation, **cls.BY_PRESET.get(preset, {}))
     config = overridden(base, changes or {}, "config")
     check_finite(config, "config")
     check_not_negative(config, "config")

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from dora.tasks.mdp.randomisation import PRESETS, Randomisation
 
@@ -25,6 +25,8 @@ class TaskConfig:
 
     PRESETS: ClassVar[Mapping[str, Randomisation]] = PRESETS
     """The named presets of the randomisation."""
+    BY_PRESET: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    """Other numbers of the task that go with a preset, by the name of the preset."""
 
     control_frequency: int = 20
     """Control steps per second [Hz]."""
