@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from dora import quiet_start
-from dora.errors import BAD_INPUT
+from dora.errors import BAD_INPUT, ManiSkillMissingError
 from dora.version import version_line
 
 COMMANDS = {
@@ -75,7 +75,12 @@ def main(words: Sequence[str] | None = None, around: Callable[[Callable[[], int]
         print(f"dora has no command {first!r}.{hint} The commands are: {', '.join(COMMANDS)}.", file=sys.stderr)
         return BAD_INPUT
     sys.argv = [f"dora {first}", *rest]
-    return around(_body(first))
+    try:
+        body = _body(first)
+    except ManiSkillMissingError as error:
+        print(error, file=sys.stderr)
+        return BAD_INPUT
+    return around(body)
 
 
 def _body(name: str) -> Callable[[], int]:

@@ -32,6 +32,17 @@ class InputError(ValueError):
         super().__init__(shown if len(shown) <= LONGEST else f"{shown[:half]} ... {shown[-half:]}")
 
 
+class ManiSkillMissingError(ModuleNotFoundError):
+    """ManiSkill is not installed: the message says how to add it. Commands print it without a traceback."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "ManiSkill is not installed: add it by `pip install --no-deps mani-skill==3.0.1` (pip leaves it out on "
+            "Python 3.13, where mplib 0.1.1, which it asks for and Dora does not use, has no wheel).",
+            name="mani_skill",
+        )
+
+
 def shown(value: object) -> str:
     """A value as a message shows it: its `repr`, cut to a few dozen characters and a few levels."""
     short = reprlib.Repr()

@@ -112,6 +112,18 @@ def test_completion_knows_commands_and_options(capsys: pytest.CaptureFixture[str
         assert word in script
 
 
+def test_without_maniskill_one_sentence_says_how_to_add_it():
+    code = "import sys; sys.modules['mani_skill'] = None; "
+    call = run(
+        sys.executable, "-c", f"{code} sys.argv[0] = 'dora'; from dora.__main__ import start; sys.exit(start(['run']))"
+    )
+    assert call.returncode == errors.BAD_INPUT
+    assert call.stderr.startswith("ManiSkill is not installed: add it by `pip install --no-deps mani-skill==")
+    assert call.stderr.count("\n") == 1
+    imported = run(sys.executable, "-c", f"{code} import dora")
+    assert "ManiSkillMissingError: ManiSkill is not installed" in imported.stderr.splitlines()[-1]
+
+
 def test_bash_completes_a_command_and_an_option(capsys: pytest.CaptureFixture[str], tmp_path: Path):
     assert command.main(["--completion", "bash"]) == 0
     path = tmp_path / "dora.bash"

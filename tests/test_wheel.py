@@ -104,4 +104,4 @@ def test_python_versions_are_said_once_and_alike() -> None:
     names = [name.rpartition(" ")[2] for name in PROJECT["classifiers"] if " :: 3." in name]
     low, high = re.findall(r"3\.(\d+)", PROJECT["requires-python"])
     assert names == [f"3.{minor}" for minor in range(int(low), int(high))]
-    assert f"Python {' or '.join(names)} on Linux" in (ROOT / "README.md").read_text()
+    assert f"Python {', '.join(names[:-1])} or {names[-1]} on Linux" in (ROOT / "README.md").read_text()
