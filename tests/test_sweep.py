@@ -19,14 +19,14 @@ from dora.commands import run
 from dora.commands import sweep as command
 from dora.errors import InputError
 from dora.sweeps.board import Board, duration, summary
-from dora.sweeps.launching import LOG, LocalLauncher, is_locked, progress_of
+from dora.sweeps.launching import LOG, LocalLauncher, is_locked, progress_of, resuming
 from dora.sweeps.plan import MECHANISM, Row, rows_of
 from dora.sweeps.sweep import State, Sweep
 
 
 def fake(mode: str) -> LocalLauncher:
     """Trains with the process that stands in for a run."""
-    return LocalLauncher(lambda folder: fake_words(folder, mode))
+    return LocalLauncher(lambda folder, zero: fake_words(folder, mode))
 
 
 def few(count: int = 3) -> list[Row]:
@@ -108,6 +108,26 @@ def test_a_finished_run_counts_whichever_command_made_it(tmp_path: Path):
     assert states(sweep) == [State.DONE, State.WAITING, State.WAITING, State.WAITING]
     assert (sweep.entries[0].success_rate, sweep.entries[0].seconds) == (0.75, 600.0)
     assert not (tmp_path / "out").exists()
+
+
+def test_zero_correction_is_evaluated_once_for_all_seeds_and_learners(tmp_path: Path):
+    rows = rows_of("paper", envs=["DoraCube-v1"], seeds=[10, 11])
+    asked: dict[Path, bool] = {}
+
+    class Noting(LocalLauncher):
+        def start(self, row: Row, folder: Path, zero: bool) -> None:
+            asked[row.name] = zero
+            if zero and row.config.has_prior:
+                (folder / "zero.csv").touch()
+            super().start(row, folder, zero)
+
+    sweep = Sweep(rows, tmp_path / "out", [])
+    sweep.run(Noting(lambda folder, zero: fake_words(folder, "well")), nothing, nothing)
+    assert set(states(sweep)) == {State.DONE}
+    guided = [row for row in rows if row.config.has_prior]
+    assert [row.name.name for row in guided if asked[row.name]] == ["ppo-affordance-s10", "ppo-grasps-s10"]
+    assert len(guided) == 6
+    assert resuming(tmp_path, zero=False) == [*resuming(tmp_path), "--no-zero-correction"]
 
 
 def test_time_that_is_left_is_that_of_runs_of_the_same_kind(tmp_path: Path):
@@ -247,7 +267,7 @@ def test_a_run_whose_worker_dies_is_repeated_and_nothing_is_lost(tmp_path: Path,
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # workers import `fake_run`, too
     from dora.sweeps.ray_cluster import RayLauncher
 
-    launcher = RayLauncher(cores=1, command=lambda folder: fake_words(folder, "slow"))
+    launcher = RayLauncher(cores=1, command=lambda folder, zero: fake_words(folder, "slow"))
     sweep, killed = Sweep(few(4), tmp_path, jobs=2), []
 
     def check() -> None:
@@ -271,7 +291,7 @@ def test_a_machine_that_does_not_see_the_folder_sends_the_files(tmp_path: Path, 
     (row,) = few(1)
     here = tmp_path / "here"
     settings = ray_cluster.plain(row.config)
-    files = ray_cluster.train_there(str(here), "no-marker", settings, lambda folder: fake_words(folder, "well"))
+    files = ray_cluster.train_there(str(here), "no-marker", settings, lambda folder, zero: fake_words(folder, "well"))
     assert set(files) == {"config.yaml", "versions.txt", "result.json", "progress.csv", "eval.csv", "zero.csv", LOG}
     here.mkdir()
     ray_cluster.receive(here, files)
@@ -279,5 +299,5 @@ def test_a_machine_that_does_not_see_the_folder_sends_the_files(tmp_path: Path, 
     other = few(2)[1]
     with pytest.raises(RuntimeError, match="status 1: the disk is full"):
         ray_cluster.train_there(
-            str(here), "x", ray_cluster.plain(other.config), lambda folder: fake_words(folder, "fails")
+            str(here), "x", ray_cluster.plain(other.config), lambda folder, zero: fake_words(folder, "fails")
         )

@@ -52,7 +52,7 @@ def test_a_run_that_ends_as_another_one_has_failed(tmp_path: Path):
     words = fake("well").command(tmp_path / row.name)
     wrong = [*words[:-1], words[-1].replace(row.config.digest(), "0" * 12)]
     sweep = Sweep([row], tmp_path)
-    sweep.run(LocalLauncher(lambda folder: wrong), nothing, nothing)
+    sweep.run(LocalLauncher(lambda folder, zero: wrong), nothing, nothing)
     assert states(sweep) == [State.FAILED]
     assert sweep.entries[0].complaint == NOT_THE_RUN
 

@@ -23,16 +23,17 @@ TAIL = 4096
 NOT_THE_RUN = "it has ended, and is not the run that is wanted"
 """Complaint about a finished run whose settings or budget are others."""
 
-Command = Callable[[Path], Sequence[str]]
-"""Words of the process that begins or goes on with the run in a folder."""
+Command = Callable[[Path, bool], Sequence[str]]
+"""Words of the process that begins or goes on with the run in a folder, which evaluates zero correction at its end or
+not."""
 
 
 class Launcher(abc.ABC):
     """Where the runs of a sweep are trained."""
 
     @abc.abstractmethod
-    def start(self, row: Row, folder: Path) -> None:
-        """Begin a run, or go on with it."""
+    def start(self, row: Row, folder: Path, zero: bool) -> None:
+        """Begin a run, or go on with it; `zero` says whether it evaluates zero correction, too."""
 
     @abc.abstractmethod
     def ended(self) -> list[tuple[Row, str | None]]:
@@ -43,9 +44,10 @@ class Launcher(abc.ABC):
         """Ask all runs to save and end, and wait for that."""
 
 
-def resuming(folder: Path) -> list[str]:
+def resuming(folder: Path, zero: bool = True) -> list[str]:
     """The process that trains in a folder which holds settings."""
-    return [sys.executable, "-m", "dora", "run", "--resume", str(folder)]
+    words = [sys.executable, "-m", "dora", "run", "--resume", str(folder)]
+    return words if zero else [*words, "--no-zero-correction"]
 
 
 def check_folder(row: Row, folder: Path) -> RunConfig | None:
@@ -144,11 +146,15 @@ class LocalLauncher(Launcher):
     command: Command = resuming
     _running: dict[Path, tuple[Row, subprocess.Popen[bytes]]] = field(default_factory=dict)
 
-    def start(self, row: Row, folder: Path) -> None:
+    def start(self, row: Row, folder: Path, zero: bool) -> None:
         """Begin a run, or go on with it; its output is appended to `output.log`."""
         with (folder / LOG).open("ab") as log:
             process = subprocess.Popen(
-                list(self.command(folder)), stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+                list(self.command(folder, zero)),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
             )
         self._running[folder] = row, process
 

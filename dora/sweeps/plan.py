@@ -101,6 +101,14 @@ class Row:
         """Kind of guidance and, if not all are in force, its parts."""
         return " ".join([self.config.guidance, *(self.config.guidance_parts or ())])
 
+    def same_zero(self, other: "Row") -> bool:
+        """Whether zero correction does the same in another run, whatever its learner and seed."""
+        a, b = (
+            (c.env, c.preset, c.guidance, c.guidance_parts, c.final_episodes, c.task)
+            for c in (self.config, other.config)
+        )
+        return a == b
+
     @property
     def digests(self) -> tuple[str, ...]:
         """Digests with which a result of these settings may have been stored, by this version or an earlier one."""

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,11 +68,11 @@ class RayLauncher(Launcher):
         self._command = command
         self._running: dict[Any, tuple[Row, Path]] = {}
 
-    def start(self, row: Row, folder: Path) -> None:
+    def start(self, row: Row, folder: Path, zero: bool) -> None:
         """Begin a run, or go on with it, wherever there is room."""
         marker = folder / f".seen-{uuid.uuid4().hex}"
         marker.touch()
-        task = self._train.remote(str(folder.absolute()), marker.name, plain(row.config), self._command)
+        task = self._train.remote(str(folder.absolute()), marker.name, plain(row.config), self._command, zero)
         self._running[task] = row, folder
 
     def ended(self) -> list[tuple[Row, str | None]]:
@@ -110,7 +110,9 @@ def _remove_markers(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def train_there(folder: str, marker: str, settings: Mapping[str, Any], command: Command) -> dict[str, bytes]:
+def train_there(
+    folder: str, marker: str, settings: Mapping[str, Any], command: Command, zero: bool = True
+) -> dict[str, bytes]:
     """Trains on a machine of the cluster; returns files of the run if they are not in the folder of the sweep already.
 
     Args:
@@ -118,6 +120,7 @@ def train_there(folder: str, marker: str, settings: Mapping[str, Any], command: 
         marker: name of a file in it, by which a machine knows that it sees the folder.
         settings: of the run.
         command: words of the process that trains in a folder.
+        zero: it evaluates zero correction, too.
 
     Raises:
         RuntimeError: the run has ended and is not finished.
@@ -129,17 +132,17 @@ def train_there(folder: str, marker: str, settings: Mapping[str, Any], command: 
     while is_locked(place):  # the process of a worker that died goes on with the run
         time.sleep(LOCK_SECONDS)
     if not is_finished(place):
-        status = _trained(place, command)
+        status = _trained(place, command(place, zero))
         if wrong := complaint(place, status):
             raise RuntimeError(wrong)
     return {} if shared else {name: (place / name).read_bytes() for name in SENT if (place / name).is_file()}
 
 
-def _trained(place: Path, command: Command) -> int:
+def _trained(place: Path, words: Sequence[str]) -> int:
     """Exit status of the process that trains; if this task is cancelled, it is asked to save first."""
     with (place / LOG).open("ab") as log:
         process = subprocess.Popen(
-            list(command(place)), stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+            list(words), stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
         )
     try:
         return process.wait()

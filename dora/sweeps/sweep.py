@@ -25,6 +25,10 @@ class State(Enum):
     FAILED = "failed"
 
 
+UNDER_WAY = (State.RUNNING, State.ELSEWHERE)
+"""States of runs that are being trained."""
+
+
 @dataclass
 class Entry:
     """A run of a sweep and how it stands.
@@ -159,11 +163,20 @@ class Sweep:
             if entry.state is State.WAITING:
                 try:
                     prepare(entry.row, entry.folder)
-                    launcher.start(entry.row, entry.folder)
+                    launcher.start(entry.row, entry.folder, not self._has_zero(entry))
                 except (InputError, OSError) as error:  # its folder is no good; the others may be
                     entry.state, entry.complaint = State.FAILED, str(error)
                 else:
                     entry.state, entry.tries = State.RUNNING, entry.tries + 1
+
+    def _has_zero(self, entry: Entry) -> bool:
+        """Whether zero correction has been evaluated, or is, on the starts and in the task of a run: whatever learns
+        there and with whatever seed, it is the same, and reports take it from there."""
+        alike = (other for other in self.entries if other.row.same_zero(entry.row) and other is not entry)
+        return any(
+            (other.folder / "zero.csv").is_file() if other.state is State.DONE else other.state in UNDER_WAY
+            for other in alike
+        )
 
     def _settle(self, entry: Entry, found: Sequence[Finished]) -> None:
         """Notes the result of a run, if there is one."""
