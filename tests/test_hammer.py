@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from math import pi
 from typing import Any
 
@@ -23,6 +24,7 @@ from dora.geometry.rotations import (
 from dora.sim.substeps import watch_physics
 from dora.tasks.hammer import mdp
 from dora.tasks.hammer.ballistics import Strike, after_fall, arrival, fall_time, slid
+from dora.tasks.hammer.nail import free_depth
 from dora.tasks.hammer.reference import ALIGN, CatchReference
 from dora.tasks.hammer.snapshot import HAND_CENTRE, HammerSnapshot, face_to_nail, handle_distance, misalignment
 from dora.tasks.hammer.task import UNKNOWN, HammerConfig, HammerTask
@@ -263,6 +265,52 @@ def test_leaning_and_pushing_do_not_count(bench: tasks.DoraEnv):
     assert depth > 5  # it yields to a strong push
     assert driven == 0.0
     bench.reset(seed=0)
+
+
+@pytest.mark.parametrize("push", [0.0, 40.0, 60.0])
+def test_pushing_on_after_a_touch_adds_nothing_to_the_blow(bench: tasks.DoraEnv, push: float):
+    """A touch just above the speed of a blow, then a push that alone sinks the whole nail."""
+    over_nail(bench, 0.001, 0.55)
+    body, touched = bench.target_object._bodies[0], [False]
+
+    def go_on(_: int) -> None:
+        touched[0] |= bench.task.nail.depth.item() > 0
+        if touched[0]:
+            body.add_force_at_point([0.0, 0.0, -push], body.entity_pose.p)
+
+    watch_physics(bench.scene, go_on)
+    depth, driven = run(bench, 8)
+    bench.reset(seed=0)
+    allowed = 1000 * free_depth(CONFIG.nail, 0.7, body.mass)
+    assert depth > 20 or push == 0.0
+    assert 0.3 < driven < allowed < 2.5
+
+
+def test_a_free_hammer_drives_no_further_than_its_momentum(bench: tasks.DoraEnv):
+    """The bound is nearly reached, so that it takes nothing away from a blow."""
+    for speed in (1.0, 1.6, 2.2):
+        body = over_nail(bench, 0.01, speed)
+        depth, driven = run(bench, 4)
+        bound = 1000 * free_depth(CONFIG.nail, (speed**2 + 2 * 9.81 * 0.01) ** 0.5, body.mass)
+        assert driven == pytest.approx(depth, abs=0.05)
+        assert 0.5 * bound < driven < bound
+
+
+def test_the_depth_of_a_free_blow_solves_its_equation():
+    for speed, mass, numbers in ((1.6, 0.28, CONFIG.nail), (1.0, 0.2, replace(CONFIG.nail, drag=0.0))):
+        both, dt = mass + numbers.mass, 1e-6
+        v, x = speed * mass / both, 0.0
+        while v > 0:
+            v, x = v - dt * (numbers.resistance + numbers.drag * v) / both, x + v * dt
+        assert free_depth(numbers, speed, mass) == pytest.approx(x, rel=1e-3)
+
+
+def test_a_fast_blow_counts(bench: tasks.DoraEnv):
+    """A face at 3 m/s is more than a centimetre below the nail's head after the step in which it meets it."""
+    over_nail(bench, 0.03, 3.0)
+    depth, driven = run(bench, 4)
+    assert driven == pytest.approx(depth, abs=0.05)
+    assert driven > 5
 
 
 def test_slow_impacts_and_no_contact_leave_it_alone(bench: tasks.DoraEnv):

@@ -49,7 +49,7 @@ def test_a_run_that_ends_as_another_one_has_failed(tmp_path: Path):
     """It must not stay `running` for good."""
     (row,) = short_rows(1000)
     prepare(row, tmp_path / row.name)
-    words = fake("well").command(tmp_path / row.name)
+    words = fake("well").command(tmp_path / row.name, True)
     wrong = [*words[:-1], words[-1].replace(row.config.digest(), "0" * 12)]
     sweep = Sweep([row], tmp_path)
     sweep.run(LocalLauncher(lambda folder, zero: wrong), nothing, nothing)

@@ -7,10 +7,13 @@ down, so that it never comes back up: while the nail moves,
     m a = F_hammer - resistance - drag * v,    v >= 0.
 
 The hammer's blow starts the nail at nearly the hammer's speed and is then spent against drag and resistance. Pushing
-moves it too, if slowly, and a nail pushed in has not been hammered: a blow is an impact above `blow_speed` of the
-hammer's striking face on the nail's head, and only what the nail sinks within `blow_window` after one counts as driven,
-while nothing but that face presses on the nail.
+moves it too, and a nail pushed in has not been hammered: a blow is an impact above `blow_speed` of the hammer's striking
+face on the nail's head. What the nail sinks within `blow_window` after one counts as driven, while nothing but that face
+presses on the nail, and no more of it than the momentum of the hammer alone could drive (`free_depth`): what the hand
+adds by pushing on after a touch does not count.
 """
+
+import math
 
 from dataclasses import dataclass
 
@@ -46,8 +49,12 @@ WATCHED = 0.3
 FACE_DEPTH, FACE_EDGE = 0.006, 0.003
 """How far from the plane and beyond the edge of the striking face a contact point may lie that is on it [m]; the
 point of a contact lies between the two surfaces, which a blow presses into each other."""
+SMALL_DRAG = 1e-3
+"""Drag as a share of the resistance below which it is left out of `free_depth` [1]."""
 UPRIGHT = 0.7
 """Smallest vertical share of a contact's normal that presses the nail down, not aside [1]."""
+STATE = ("_depth", "_driven", "_since", "_speed", "_spare")
+"""Buffers of a nail that its state holds."""
 DOWN = (0.7071068, 0.0, 0.7071068, 0.0)
 """Turns +x, the axis of joints and cylinders, into -z (wxyz): the joint's coordinate is the nail's depth."""
 PINE, IRON = (0.78, 0.60, 0.38, 1.0), (0.45, 0.46, 0.48, 1.0)
@@ -78,6 +85,23 @@ class NailSettings:
     """Time after a blow in which the nail's motion counts as driven, if nothing else touches the nail [s]."""
 
 
+def free_depth(settings: NailSettings, speed: float, mass: float) -> float:
+    """How far a free hammer drives the nail, at most [m].
+
+    Hammer and nail go on together with the hammer's momentum, m v' = -resistance - drag * v until they stand.
+
+    Args:
+        settings: numbers of the nail.
+        speed: of the hammer relative to the nail before the impact [m/s].
+        mass: of the hammer [kg].
+    """
+    both, r, d = mass + settings.mass, settings.resistance, settings.drag
+    speed *= mass / both
+    if d * speed < SMALL_DRAG * r:
+        return both * speed * speed / (2 * r)
+    return both / d * (speed - r / d * math.log1p(d * speed / r))
+
+
 class Nail:
     """One upright nail per environment, in a post that stands on the table.
 
@@ -99,6 +123,7 @@ class Nail:
         self._driven = np.zeros(n, np.float32)
         self._since = np.full(n, settings.blow_window, np.float32)
         self._speed = np.zeros(n, np.float32)
+        self._spare = np.zeros(n, np.float32)
         self._hammers: list[sapien.physx.PhysxRigidDynamicComponent] = []
         self._faces: Float[np.ndarray, "n 3"] = np.zeros((n, 3))
         self._radii: Float[np.ndarray, " n"] = np.zeros(n)
@@ -122,7 +147,7 @@ class Nail:
         self.articulation.set_qpos(torch.zeros(len(rows), 1, device=self._device))
         self.articulation.set_qvel(torch.zeros(len(rows), 1, device=self._device))
         index = rows.cpu().numpy()
-        for buffer in (self._depth, self._driven, self._speed):
+        for buffer in (self._depth, self._driven, self._speed, self._spare):
             buffer[index] = 0.0
         self._since[index] = self.settings.blow_window
         self._hold(index.tolist())
@@ -152,12 +177,20 @@ class Nail:
         if depth > before + MOVED:
             face, other = self._pressed(i, contacts)
             if face and self._speed[i] > self.settings.blow_speed:
-                self._since[i] = 0.0
+                self._strike(i)
             if self._since[i] < self.settings.blow_window and not other:
-                self._driven[i] += depth - before
+                counted = min(depth - before, self._spare[i])
+                self._driven[i] += counted
+                self._spare[i] -= counted
             self._depth[i] = depth
             self._limit(i)
         self._speed[i] = self._approach(i, float(body.qvel[0]))
+
+    def _strike(self, i: int) -> None:
+        """A blow begins, or goes on in the next physics step."""
+        spare = self._spare[i] if self._since[i] < self.settings.blow_window else 0.0
+        self._spare[i] = max(spare, free_depth(self.settings, float(self._speed[i]), self._hammers[i].mass))
+        self._since[i] = 0.0
 
     def _pressed(self, i: int, contacts: list) -> tuple[bool, bool]:
         """Whether the striking face pressed the nail down in the last physics step, and whether anything else touched
@@ -180,7 +213,8 @@ class Nail:
         if pose is None or abs(point.normal[2]) < UPRIGHT:
             return False
         away = pose[:3, :3].T @ (point.position - pose[:3, 3]) - self._faces[i]
-        return bool(abs(away[0]) < FACE_DEPTH and np.hypot(away[1], away[2]) < self._radii[i] + FACE_EDGE)
+        deep = FACE_DEPTH + max(float(self._speed[i]), 0.0) * self._dt  # the face goes on in the step of the impact
+        return bool(abs(away[0]) < deep and np.hypot(away[1], away[2]) < self._radii[i] + FACE_EDGE)
 
     def _approach(self, i: int, nail_speed: float) -> float:
         """Downward speed of the striking face relative to the nail [m/s]; 0 if the hammer is far away. Keeps the
@@ -209,14 +243,14 @@ class Nail:
 
     def get_state(self) -> dict[str, Tensor]:
         """What the simulator does not keep, each (n,)."""
-        names = ("_depth", "_driven", "_since", "_speed")
-        return {f"nail{name}": torch.tensor(getattr(self, name), device=self._device) for name in names}
+        return {f"nail{name}": torch.tensor(getattr(self, name), device=self._device) for name in STATE}
 
     def set_state(self, state: dict[str, Tensor], rows: Tensor) -> None:
         """Inverse of `get_state` for the environments `rows` (b,)."""
         index = rows.cpu().numpy()
-        for name in ("_depth", "_driven", "_since", "_speed"):
-            getattr(self, name)[index] = state[f"nail{name}"].reshape(-1).cpu().numpy()
+        for name in STATE:
+            if f"nail{name}" in state:
+                getattr(self, name)[index] = state[f"nail{name}"].reshape(-1).cpu().numpy()
         self._hold(index.tolist())
         self._look(index.tolist())
 
