@@ -270,7 +270,7 @@ def test_leaning_and_pushing_do_not_count(bench: tasks.DoraEnv):
 @pytest.mark.parametrize("push", [0.0, 40.0, 60.0])
 def test_pushing_on_after_a_touch_adds_nothing_to_the_blow(bench: tasks.DoraEnv, push: float):
     """A touch just above the speed of a blow, then a push that alone sinks the whole nail."""
-    over_nail(bench, 0.001, 0.55)
+    over_nail(bench, 0.006, 0.55)
     body, touched = bench.target_object._bodies[0], [False]
 
     def go_on(_: int) -> None:
@@ -282,7 +282,7 @@ def test_pushing_on_after_a_touch_adds_nothing_to_the_blow(bench: tasks.DoraEnv,
     depth, driven = run(bench, 8)
     bench.reset(seed=0)
     allowed = 1000 * free_depth(CONFIG.nail, 0.7, body.mass)
-    assert depth > 20 or push == 0.0
+    assert depth > 12 or push == 0.0
     assert 0.3 < driven < allowed < 2.5
 
 
