@@ -15,7 +15,7 @@ EQUATION = re.compile(r'<(?P<tag>div|span) class="arithmatex">\\[(\[](?P<tex>.*?
 GLANCE = "<!-- results at a glance -->"
 """Mark of the place for the table of results, in the pages that show one."""
 COLUMNS = {
-    "task": "task", "preset": "preset", "agent": "agent", "guidance": "guidance", "success %": "success %",
+    "task": "task", "preset": "preset", "agent": "agent", "guidance": "guidance", "seeds": "seeds", "success %": "success %",
     "scripted (zero correction) %": "scripted %", "minutes": "minutes",
 }  # fmt: skip
 """Columns that are shown there, and how they are called."""

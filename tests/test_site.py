@@ -110,11 +110,12 @@ def hooks() -> dict[str, Any]:
 def test_results_at_a_glance_are_those_of_the_table() -> None:
     table = (DOCS / "results" / "tables.md").read_text()
     rows = hooks()["at_a_glance"](table).splitlines()
-    assert rows[0] == "| task | preset | agent | guidance | success % | scripted % | minutes |"
+    assert rows[0] == "| task | preset | agent | guidance | seeds | success % | scripted % | minutes |"
+    assert "\n".join(rows) in (ROOT / "README.md").read_text()
     assert len(rows) == sum(line.startswith("|") for line in table.splitlines()) > 2
     for row, line in zip(rows[2:], table.splitlines()[2:], strict=False):
         cells = [cell.strip() for cell in line.strip("| ").split("|")]
-        assert row.strip("| ").split(" | ") == [*cells[:4], cells[5], cells[7], cells[10]]
+        assert row.strip("| ").split(" | ") == [*cells[:6], cells[7], cells[10]]
 
 
 def test_equations_become_mathml() -> None:
