@@ -33,6 +33,8 @@ ROOMS = {
     "tasks.guidance": ("dora/tasks/guidance/*.py",),
     "tasks.env": ("dora/tasks/env/*.py",),
     "tasks.hammer": ("dora/tasks/hammer/*.py",),
+    "tasks.microwave": ("dora/tasks/microwave/*.py",),
+    "sim": ("dora/sim/*.py",),
     "agents": ("dora/agents/*.py",),
     "agents.collecting": ("dora/agents/collecting/*.py",),
     "agents.learners": ("dora/agents/learners/*.py",),
