@@ -10,13 +10,21 @@ RECORDS = "DORA_NONFINITE"
 """Environment variable with the folder for the last states of simulations that were not finite."""
 LONGEST = 1200
 """Characters of a message above which its middle is left out."""
-BAD_INPUT = 2
-"""Exit status of a command after an `InputError`."""
+BAD_INPUT, FAILED = 2, 1
+"""Exit status of a command after an `InputError`, and after a `RunFailure`."""
 LONGEST_VALUE, DEEPEST_VALUE = 80, 3
 """Characters and levels of a value in a message, beyond which it is cut."""
 
 P = ParamSpec("P")
 """Arguments of a command."""
+
+
+def one_line(message: str) -> str:
+    """A message as a terminal shows it in one line: line breaks and other characters that it does not show are written
+    as escapes, and the middle of a long one is left out."""
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
+    half = LONGEST // 2
+    return shown if len(shown) <= LONGEST else f"{shown[:half]} ... {shown[-half:]}"
 
 
 class InputError(ValueError):
@@ -27,9 +35,7 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
-        half = LONGEST // 2
-        super().__init__(shown if len(shown) <= LONGEST else f"{shown[:half]} ... {shown[-half:]}")
+        super().__init__(one_line(message))
 
 
 class ManiSkillMissingError(ModuleNotFoundError):
@@ -43,6 +49,21 @@ class ManiSkillMissingError(ModuleNotFoundError):
         )
 
 
+class RunFailure(RuntimeError):
+    """A run or its workers cannot go on, though the input is good: the message is one sentence that says why.
+
+    Commands print it without a traceback, those that train with the command that resumes, and end with exit status 1.
+    Line breaks are written as escapes, as in an `InputError`.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(one_line(message))
+
+
+class WorkerFailure(RunFailure):
+    """A worker process died, hangs, or raised something; this process is well."""
+
+
 def shown(value: object) -> str:
     """A value as a message shows it: its `repr`, cut to a few dozen characters and a few levels."""
     short = reprlib.Repr()
@@ -51,8 +72,15 @@ def shown(value: object) -> str:
     return short.repr(value)
 
 
+def said(kind: str, message: object) -> str:
+    """The end of a sentence that tells of an exception: its kind and what it said, if anything, with one full stop."""
+    text = str(message).strip().rstrip(".")
+    return f"{kind}: {text}." if text else f"{kind}."
+
+
 def command(body: Callable[P, int | None]) -> Callable[P, int]:
-    """Decorates what a command does: returns its exit status, 0 for None; bad input is printed, and ends with 2."""
+    """Decorates what a command does: returns its exit status, 0 for None; bad input is printed, and ends with 2, what
+    cannot go on is printed, and ends with 1."""
 
     @functools.wraps(body)
     def run(*args: P.args, **kwargs: P.kwargs) -> int:
@@ -61,16 +89,8 @@ def command(body: Callable[P, int | None]) -> Callable[P, int]:
         except InputError as error:
             print(error, file=sys.stderr)
             return BAD_INPUT
+        except RunFailure as error:
+            print(error, file=sys.stderr)
+            return FAILED
 
     return run
-
-
-class RunFailure(RuntimeError):
-    """A run cannot go on, but can be resumed: the message is one sentence that says why.
-
-    Scripts print it without a traceback, with the command that resumes, and end with exit status 1.
-    """
-
-
-class WorkerFailure(RunFailure):
-    """A worker process died, hangs, or raised something; this process is well."""

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +45,18 @@ class Breaking(PointMass):
     def __init__(self, *args: Any, at: int = 60, what: str = "nan", **kwargs: Any):
         super().__init__(*args, **kwargs)
         self.at, self.what, self.steps = at, what, 0
+        if what == "die at the start" and parent_process() is not None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if what == "raise at the start" and parent_process() is not None:
+            raise ValueError("one line\nanother line")
 
     def step(self, action: Tensor) -> Any:
         self.steps += 1
         observation, reward, fail, truncated, info = super().step(action)
         if self.steps == self.at and self.what == "die":
             os.kill(os.getpid(), signal.SIGKILL)
+        if self.steps == self.at and self.what == "raise":
+            raise ValueError("one line\nanother line.")
         if self.steps == self.at and self.what == "hang":
             time.sleep(1000)
         if self.steps == self.at and self.what == "nan":
@@ -140,6 +147,25 @@ def test_a_worker_that_dies_leaves_a_run_that_goes_on(tmp_path: Path, ahead: boo
     assert read_checkpoint(RunFolder(tmp_path / "run").latest).progress["env_steps"] > 0
     assert json.loads((tmp_path / "run" / "result.json").read_text())["finished"] is False
     assert run(tmp_path / "run", config, resume=True)["finished"]
+
+
+@pytest.mark.parametrize(
+    ("what", "sentence"),
+    [
+        ("raise", r"Worker 0 failed with ValueError: one line\nanother line."),
+        ("raise at the start", r"Worker 0 failed with ValueError: one line\nanother line."),
+        ("die at the start", "A worker process died while it started: worker 0 (ended by SIGKILL)."),
+    ],
+)
+def test_what_ends_a_worker_is_told_in_one_sentence_without_its_traceback(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], what: str, sentence: str
+):
+    before = children()
+    with pytest.raises(WorkerFailure) as caught:
+        run(tmp_path / "run", dataclasses.replace(SHORT, workers=1), functools.partial(Breaking, what=what, at=40))
+    assert str(caught.value) == sentence
+    assert "Traceback" not in capfd.readouterr().err
+    assert children() == before
 
 
 def test_a_worker_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -13,7 +13,7 @@ from torchrl.collectors import Collector
 
 from dora.agents.collecting.task_env import TaskEnv, TaskFactory
 from dora.agents.learners.networks import Policy
-from dora.errors import InputError, WorkerFailure
+from dora.errors import InputError, WorkerFailure, said
 
 FOREVER = 2**62
 """Number of transitions after which collectors would stop."""
@@ -92,5 +92,5 @@ def explained(error: BaseException) -> Exception | None:
     if isinstance(cause, InputError):
         return InputError(str(cause))
     if cause is not None:
-        return WorkerFailure(f"a worker of the cluster failed with {type(cause).__name__}: {cause}")
+        return WorkerFailure(f"A worker of the cluster failed with {said(type(cause).__name__, cause)}")
     return WorkerFailure(f"A worker of the cluster died ({type(error).__name__}).")

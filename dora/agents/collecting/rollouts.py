@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, wait
 from contextlib import contextmanager
-from multiprocessing import active_children
+from multiprocessing import active_children, connection
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,7 +22,7 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from dora.agents.collecting.ray_collector import explained, ray_collector, whole_batch
 from dora.agents.collecting.task_env import Task, TaskEnv, TaskFactory
 from dora.agents.learners.networks import Policy
-from dora.errors import InputError, RunFailure, WorkerFailure
+from dora.errors import InputError, RunFailure, WorkerFailure, said
 from dora.parallel import name_leftovers, name_of_process, signals_blocked
 
 Result = TypeVar("Result")
@@ -30,6 +30,8 @@ SHUTDOWN_SECONDS = 10.0
 """Workers that have not ended after this time are killed [s]."""
 POLL_SECONDS = 0.2
 """Longest time between two calls of `check` while workers collect [s]."""
+GRACE = 0.5
+"""Time that a process has for its end after its pipe was closed [s]."""
 PATIENCE = 180.0
 """Time without a batch after which workers count as hung [s]."""
 LESS_URGENT = 5
@@ -57,12 +59,13 @@ class WorkerTaskEnv(TaskEnv):
 
 @contextmanager
 def _reported(report: Path) -> Iterator[None]:
+    """Ends this process after an exception; what it was is in the report, and nothing is printed."""
     try:
         yield
     except Exception as error:
         kind = "InputError" if isinstance(error, InputError) else type(error).__name__
         report.write_text(f"{kind}\n{error}")
-        raise
+        raise SystemExit(1) from None
 
 
 def _make_worker_env(make_task: TaskFactory, report: Path, seed: int, stagger: bool, nice: int) -> WorkerTaskEnv:
@@ -77,14 +80,20 @@ class _Workers(MultiSyncCollector):
     """TorchRL's collector of worker processes; one whose making fails lets go of what it had made.
 
     Else its queues are closed only when the interpreter ends, where that waits forever for a thread that cannot start.
+
+    Raises:
+        WorkerFailure: a worker died while it started.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
         try:
             super().__init__(*args, **kwargs)
-        except BaseException:
+        except BaseException as error:
+            ended = _ended(getattr(self, "procs", ()))
             for scheme in (getattr(self, "_weight_sync_schemes", None) or {}).values():
                 scheme.shutdown()
+            if ended:
+                raise WorkerFailure(f"A worker process died while it started: worker {ended}.") from error
             raise
 
 
@@ -177,7 +186,7 @@ class Rollouts:
                 return make()
 
         before = set(active_children())
-        with self._explained():
+        with self._scratch_removed_by_failure(), self._explained():
             future = _in_thread(make_quietly)
             try:
                 while not wait([future], POLL_SECONDS).done:
@@ -190,7 +199,6 @@ class Rollouts:
                     _kill(set(active_children()) - before)
                     wait([future], POLL_SECONDS)
                 _kill(set(active_children()) - before)
-                self._scratch.cleanup()
                 raise
 
     def collect(self, check: Callable[[], None] = lambda: None) -> TensorDictBase:
@@ -244,6 +252,15 @@ class Rollouts:
         self.close(at_once=kind is not None)
 
     @contextmanager
+    def _scratch_removed_by_failure(self) -> Iterator[None]:
+        """Remove the folder of the reports if starting fails, after they were read."""
+        try:
+            yield
+        except BaseException:
+            self._scratch.cleanup()
+            raise
+
+    @contextmanager
     def _explained(self) -> Iterator[None]:
         """Replace TorchRL's "a process failed" by what the worker said, or by how it ended."""
         try:
@@ -251,18 +268,17 @@ class Rollouts:
         except Exception as error:
             if (failure := explained(error)) is not None:  # Ray's errors are of the worker's class, too
                 raise failure from error
-            if isinstance(error, RunFailure | InputError):
-                raise
             for index, report in enumerate(self._reports):
                 if report.exists():
                     kind, _, message = report.read_text().partition("\n")
                     if kind == "InputError":
                         raise InputError(message) from None
-                    raise WorkerFailure(f"worker {index} failed with {kind}: {message}") from error
-            ended = [f"{k} ({_how(p.exitcode)})" for k, p in enumerate(self._processes) if not p.is_alive()]
-            if ended or isinstance(error, EOFError):
-                raise WorkerFailure(f"A worker process died: worker {', '.join(ended)}.") from error
-            raise
+                    raise WorkerFailure(f"Worker {index} failed with {said(kind, message)}") from error
+            if isinstance(error, RunFailure | InputError):
+                raise
+            if ended := _ended(self._processes):
+                raise WorkerFailure(f"A worker process died: worker {ended}.") from error
+            raise WorkerFailure(f"The workers failed with {said(type(error).__name__, error)}") from error
 
 
 def _in_thread(function: "Callable[[], Result]") -> "Future[Result]":
@@ -284,6 +300,16 @@ def _kill(processes: Iterable[Any]) -> None:
     for process in processes:
         if process.is_alive():
             process.kill()
+
+
+def _ended(processes: Sequence[Any]) -> str:
+    """Those of the processes that have ended, as a message names them; waits a little for one whose pipe is closed."""
+    if not processes:
+        return ""
+    for process in processes:
+        if connection.wait([process.sentinel], GRACE / len(processes)):
+            process.join(GRACE)
+    return ", ".join(f"{k} ({_how(p.exitcode)})" for k, p in enumerate(processes) if not p.is_alive())
 
 
 def _how(status: int | None) -> str:
