@@ -40,13 +40,15 @@ CHUNK = 4
 """Cases that a process takes at once, where they are short."""
 PATIENCE = 600.0
 """Time without any finished case after which the workers of an evaluation count as hung [s]."""
+PATIENCE_OF_CASES = 1800.0
+"""The same for the cases of `run_cases`, which are longer: batches of episodes, with the making of their task [s]."""
 POLL_SECONDS = 0.2
 """Longest time between two calls of `check` while workers are busy [s]."""
 SHARED = Path("/dev/shm")
 """Where the system keeps semaphores by name."""
 LEFT = re.compile(r"(?:sem\.mp-)?dora-(?P<space>\d+)-(?P<process>\d+)-(?P<start>\d+)-.*")
 """Name of a semaphore or temporary folder with the process that made it, see `name_of_process`."""
-DIED = "a worker process died (a crash in native code, or too little memory): run with one process to see why."
+DIED = "A worker process died (a crash in native code, or too little memory): run with one process to see why."
 """Message of the error after the death of a worker."""
 
 
@@ -168,6 +170,7 @@ def run_cases(
     processes: int | None = None,
     progress: Progress | None = None,
     chunk: int = CHUNK,
+    patience: float = PATIENCE_OF_CASES,
 ) -> list[Result]:
     """Results of all cases, in their order, by processes that end with the call.
 
@@ -179,7 +182,7 @@ def run_cases(
     if count <= 1:
         return WorkerPool(factory, arguments, 0).map(cases, factory(*arguments), report)
     with WorkerPool(factory, arguments, count) as pool:
-        return pool.map(cases, progress=report, chunk=chunk)
+        return pool.map(cases, progress=report, chunk=chunk, patience=patience)
 
 
 def name_of_process() -> str:

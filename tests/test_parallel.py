@@ -1,5 +1,7 @@
 """Worker processes: results in order, errors that reach the caller, and no process left behind."""
 
+import inspect
+import math
 import os
 import signal
 import subprocess
@@ -10,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from dora.parallel import WorkerPool, run_cases
+from dora.errors import FAILED, WorkerFailure, command
+from dora.parallel import DIED, WorkerPool, run_cases
 
 CASES = list(range(11))
 
@@ -45,8 +48,32 @@ def test_this_process_does_its_share_and_the_others_keep_their_task():
 
 
 def test_a_process_that_dies_is_told_in_one_sentence():
-    with pytest.raises(RuntimeError, match="a worker process died"):
+    with pytest.raises(RuntimeError, match="A worker process died"):
         run_cases(make_deadly, (), CASES, processes=2)
+
+
+def make_endless() -> Callable[[int], None]:
+    """A task that does not end."""
+    return lambda case: time.sleep(1000)
+
+
+def test_processes_that_hang_are_ended_and_told_of():
+    start = time.monotonic()
+    with pytest.raises(WorkerFailure, match=r"The worker processes hang: none has finished anything for 1 s\."):
+        run_cases(make_endless, (), CASES, processes=2, patience=1.0)
+    assert time.monotonic() - start < 30
+    assert math.isfinite(inspect.signature(run_cases).parameters["patience"].default)
+
+
+@command
+def work() -> None:
+    """A command whose workers die."""
+    run_cases(make_deadly, (), CASES, processes=2)
+
+
+def test_a_command_whose_workers_die_says_so_in_one_line(capfd: pytest.CaptureFixture[str]):
+    assert work() == FAILED
+    assert capfd.readouterr().err == f"{DIED}\n"
 
 
 SCRIPT = """

@@ -17,7 +17,7 @@ from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
 import dora  # noqa: F401  (registers Dora's tasks)
 from dora.errors import InputError
-from dora.parallel import run_cases
+from dora.parallel import PATIENCE_OF_CASES, run_cases
 from dora.sim import BACKEND, StepProfile, can_render
 from dora.sim.batch.rendering import refuse_pictures, replace_materials, wants_pictures
 
@@ -92,7 +92,10 @@ def measure(env_id: str, num_envs: int, workers: int, seconds: float, obs_mode: 
         refuse_pictures(obs_mode, None)
     together = multiprocessing.get_context("spawn").Barrier(workers)
     arguments = (env_id, obs_mode, num_envs, seconds, together)
-    ours = run_cases(_Measurement, arguments, range(workers), workers, chunk=1)  # the barrier gives each process one
+    patience = PATIENCE_OF_CASES + seconds
+    ours = run_cases(  # the barrier gives each process one
+        _Measurement, arguments, range(workers), workers, chunk=1, patience=patience
+    )
     rate = sum(part.steps / part.seconds for part in ours)
     shares = {name: float(np.mean([part.shares[name] for part in ours])) for name in ours[0].shares}
     references = {count: _reference_rate(env_id, obs_mode, count, seconds) for count in REFERENCE_PROCESSES}
