@@ -33,13 +33,9 @@ def as_tensor(value: Any, what: str, device: torch.device | str | None = None) -
     Raises:
         InputError: what it holds are not numbers, or its rows have different lengths.
     """
-    if isinstance(value, list | tuple) and _holds_tensors(value):
+    if isinstance(value, list | tuple) and _holds(value, Tensor):
         value = _stacked(value, what)
-    if not isinstance(value, Tensor):
-        array = _array(value, what)
-        value = torch.from_numpy(array.astype(np.int64 if array.dtype.kind == "u" else array.dtype, copy=True))
-    if value.is_complex():
-        raise InputError(f"{what} must be real numbers, not complex ones.")
+    value = _dense(value, what) if isinstance(value, Tensor) else torch.from_numpy(_array(value, what))
     value = value.detach().to(device)
     return _single(value) if value.dtype == torch.float64 else value
 
@@ -55,8 +51,9 @@ def _single(value: Tensor) -> Tensor:
     return torch.where(value.isfinite(), value.clamp(-most, most), value).to(torch.float32)
 
 
-def _holds_tensors(value: Any) -> bool:
-    return isinstance(value, Tensor) or (isinstance(value, list | tuple) and any(map(_holds_tensors, value)))
+def _holds(value: Any, kind: type) -> bool:
+    """Whether a value is of a type, or a list or tuple that holds such a value at any depth."""
+    return isinstance(value, kind) or (isinstance(value, list | tuple) and any(_holds(part, kind) for part in value))
 
 
 def _stacked(value: Any, what: str) -> Tensor:
@@ -66,14 +63,36 @@ def _stacked(value: Any, what: str) -> Tensor:
         raise InputError(f"{what} has rows of different shapes: give all rows one shape.") from error
 
 
+def _dense(value: Tensor, what: str) -> Tensor:
+    """A tensor of real numbers that is neither sparse, nor quantised, nor nested."""
+    if value.is_complex():
+        raise InputError(f"{what} must be real numbers, not complex ones.")
+    if value.is_quantized:
+        raise InputError(f"{what} is a quantised tensor: pass what its dequantize() returns.")
+    if value.is_nested:
+        raise InputError(f"{what} is a nested tensor, whose rows may have different lengths: stack its rows.")
+    return value if value.layout == torch.strided else value.to_dense()
+
+
 def _array(value: Any, what: str) -> np.ndarray:
+    """A new array of a type that torch has: native byte order, at most 64 bits, whole numbers with a sign."""
+    if _holds(value, np.ma.MaskedArray):
+        raise InputError(f"{what} is a masked array, whose mask would be lost: pass what its filled(...) returns.")
     try:
         array = np.asarray(value)
     except ValueError as error:
         raise InputError(f"{what} has rows of different lengths: give all rows one length.") from error
     if array.dtype.kind not in "biuf":
         raise InputError(f"{what} must be numbers, not {type(value).__name__}: pass an array or a tensor.")
-    return array
+    if array.dtype.kind == "u":
+        if array.size and array.max() > np.iinfo(np.int64).max:
+            raise InputError(f"{what} has {array.max()}: whole numbers may be at most {np.iinfo(np.int64).max}.")
+        return array.astype(np.int64)
+    if array.dtype.itemsize > 8:  # of more digits than torch has
+        most = np.finfo(np.float64).max
+        array = np.where(np.isfinite(array), array.clip(-most, most), array)
+    kind = min(array.dtype.newbyteorder("="), np.dtype(np.float64)) if array.dtype.kind == "f" else array.dtype
+    return array.astype(kind.newbyteorder("="))
 
 
 def tensors(state: Any, what: str, device: torch.device | str | None = None) -> Any:

@@ -1,5 +1,6 @@
 """Environments, seeds, numbers and names as callers write them."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -113,6 +114,48 @@ def test_numbers_of_any_form_become_tensors_without_gradient():
     for wrong in ("x", [None], object(), torch.zeros(1, dtype=torch.complex64), [torch.zeros(1), torch.zeros(2)]):
         with pytest.raises(InputError, match="it "):
             as_tensor(wrong, "it")
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        np.array([1, 2], ">f4"),
+        np.array([1, 2], ">f8"),
+        np.array([1, 2], np.longdouble),
+        torch.tensor([1.0, 2.0]).to_sparse(),
+        [torch.tensor(1.0).to_sparse(), torch.tensor(2.0)],
+    ],
+)
+def test_numbers_of_any_type_become_tensors(form: Any):
+    found = as_tensor(form, "it")
+    assert torch.equal(found, torch.tensor([1.0, 2.0]))
+    assert (found.dtype, found.layout) == (torch.float32, torch.strided)
+
+
+def test_whole_numbers_of_any_byte_order_become_tensors():
+    assert checked_rows(np.array([1, 0], ">i8"), COUNT).tolist() == [1, 0]
+    assert as_tensor(np.array([1, 2], ">u2"), "it").dtype == torch.int64
+    big = as_tensor(np.array([1, -1]) * np.longdouble("1e400"), "it")
+    assert big.isfinite().all()  # as of a double that is too large
+    assert big.sign().tolist() == [1, -1]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: np.ma.array([1.0, 2.0], mask=[False, True]), "masked array"),
+        (lambda: [np.ma.array([1.0], mask=[True])], "masked array"),
+        (lambda: torch.quantize_per_tensor(torch.zeros(2), 0.1, 0, torch.qint8), "quantised"),
+        (lambda: torch.nested.nested_tensor([torch.zeros(2), torch.zeros(3)]), "nested"),
+        (lambda: np.array([2**63], np.uint64), "at most 9223372036854775807"),
+        (lambda: (number for number in [1]), "must be numbers, not generator"),
+    ],
+)
+def test_numbers_that_no_tensor_holds_are_refused_in_one_sentence(make: Callable[[], Any], words: str):
+    with pytest.raises(InputError, match=words) as error:
+        as_tensor(make(), "it")
+    assert "\n" not in str(error.value)
 
 
 def test_a_changed_array_does_not_change_the_tensor():

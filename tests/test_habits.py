@@ -335,6 +335,11 @@ def test_actions_of_any_form_act_alike(env: Any):
         ({"arm": [0.0]}, "one robot only"),
         ({"control_mode": "telepathy", "action": [0.0]}, "control_mode"),
         ({"control_mode": None}, "action"),
+        ({"control_mode": "pd_joint_pos", "action": [float("nan")]}, "pd_joint_pos"),
+        ({"control_mode": "pd_joint_pos", "action": [[0.0, 1.0]]}, "pd_joint_pos"),
+        ({"control_mode": "pd_joint_pos", "action": np.full((COUNT, 8), np.inf)}, "pd_joint_pos"),
+        ({1: [0.0], "arm": [0.0]}, "one robot only"),
+        ((number for number in [0.0]), "generator"),
     ],
 )
 def test_actions_that_fit_nothing_are_refused_in_one_sentence(env: Any, action: Any, words: str):
@@ -343,6 +348,22 @@ def test_actions_that_fit_nothing_are_refused_in_one_sentence(env: Any, action: 
         env.step(action)
     assert "\n" not in str(error.value)
     assert torch.equal(base(env).get_state(), state)
+
+
+def test_another_control_mode_works_after_an_action_for_it_was_refused():
+    """As if there had been no such action: with its own controller and the properties of its drives."""
+    found, good = [], {"control_mode": "pd_joint_pos", "action": np.full((COUNT, 8), 0.1)}
+    for refused in (False, True):
+        env = make(STOCK, control_mode="pd_joint_delta_pos")
+        env.reset(seed=0)
+        if refused:
+            with pytest.raises(InputError, match="for pd_joint_pos has shape"):
+                env.step({"control_mode": "pd_joint_pos", "action": np.zeros((COUNT, 3))})
+            assert base(env).agent.control_mode == "pd_joint_delta_pos"
+        found.append([env.step(action)[0] for action in (np.ones((COUNT, 8)), good, good)])
+        env.close()
+    for one, two in zip(*found, strict=True):
+        assert torch.equal(one, two)
 
 
 def test_a_recorder_takes_what_the_environment_takes(env: Any, tmp_path: Any):

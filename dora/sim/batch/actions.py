@@ -41,27 +41,47 @@ def check_action(env: Any, action: Any) -> None:
     Args:
         env: an unwrapped ManiSkill environment on `physx_cpu_batch`.
         action: None, an array (environments, dimension), or a dictionary of those by robot, or a dictionary
-            with ``control_mode`` and ``action``. One environment may leave the batch axis out.
+            with ``control_mode`` and ``action``, which puts that mode in force. One environment may leave the batch
+            axis out.
 
     Raises:
         InputError: a shape or a robot's name does not fit, or a number is not finite.
     """
+    if action is not None and env.agent is None:
+        raise InputError("The environment has no robot: pass None as the action.")
     if isinstance(action, Mapping) and "control_mode" in action:
-        modes = getattr(env.agent, "supported_control_modes", [])
-        if modes and action["control_mode"] not in modes:
+        if (modes := getattr(env.agent, "supported_control_modes", None)) is None:
+            raise _several(env._orig_single_action_space)
+        if action["control_mode"] not in modes:
             mode = action["control_mode"]
             raise InputError(f"The action is for the unknown control_mode {mode!r}: {suggestion(mode, modes)}")
         if action["control_mode"] == env.agent.control_mode:
-            check_array(action.get("action"), env._orig_single_action_space, env.num_envs, "")
+            check_array(action.get("action"), env._orig_single_action_space, env.num_envs)
         else:
-            _check_finite(action.get("action"), "", env.num_envs)
+            _switch_mode(env, action["control_mode"], action.get("action"))
     elif isinstance(action, Mapping):
         _check_robots(env, action)
     elif isinstance(action, np.ndarray | torch.Tensor):
         check_array(action, env._orig_single_action_space, env.num_envs, "")
 
 
-def _check_robots(env: Any, action: Mapping[str, Any]) -> None:
+def _switch_mode(env: Any, mode: str, action: Any) -> None:
+    """Puts another control mode in force, as ManiSkill would, if the action fits it; else everything stays as it is."""
+    agent, present = env.agent, env.agent.control_mode
+    is_new = mode not in agent.controllers
+    agent.set_control_mode(mode)
+    try:
+        check_array(action, agent.single_action_space, env.num_envs, f" for {mode}")
+    except InputError:
+        agent.set_control_mode(present)
+        if is_new:  # ManiSkill sets the properties of the drives when it makes a controller
+            del agent.controllers[mode]
+            agent.controller.set_drive_property()
+        raise
+    agent.controller.reset()
+
+
+def _check_robots(env: Any, action: Mapping[Any, Any]) -> None:
     space = env._orig_single_action_space
     if not isinstance(space, spaces.Dict):
         raise InputError(
@@ -69,7 +89,7 @@ def _check_robots(env: Any, action: Mapping[str, Any]) -> None:
             f"({env.num_envs}, {space.shape[0]})."
         )
     if action.keys() != space.spaces.keys():
-        raise InputError(f"The action has keys {sorted(action)} but the robots are {sorted(space.spaces)}.")
+        raise InputError(f"The action has keys {sorted(action, key=str)} but the robots are {sorted(space.spaces)}.")
     for name, part in action.items():
         check_array(part, space[name], env.num_envs, f" of {name}")
 
@@ -77,11 +97,15 @@ def _check_robots(env: Any, action: Mapping[str, Any]) -> None:
 def check_array(action: Any, space: Any, environments: int, whose: str = "") -> None:
     """Check an array of actions (environments, dimension) of a space of one action; InputError as `check_action`."""
     if isinstance(space, spaces.Dict):
-        raise InputError(f"There are several robots: pass a dictionary of actions for {sorted(space.spaces)}.")
+        raise _several(space)
     shape, single = tuple(np.shape(action)), tuple(space.shape)
     if shape != (environments, *single) and not (environments == 1 and shape == single):
         raise InputError(f"The action{whose} has shape {shape} but {(environments, *single)} is needed.")
     _check_finite(action, whose, environments)
+
+
+def _several(space: spaces.Dict) -> InputError:
+    return InputError(f"There are several robots: pass a dictionary of actions for {sorted(space.spaces)}.")
 
 
 def _check_finite(action: Any, whose: str, environments: int) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dora.arguments import as_tensor
 from dora.errors import InputError
+from dora.sim.batch.actions import check_array
 from dora.tasks.env.arm import Arm
 from dora.tasks.guidance.candidate_choice import CandidateChoice
 from dora.tasks.mdp.observations import Entry, columns_by_arm
@@ -70,12 +71,16 @@ class ArmGroup(dict[str, Arm]):
         for arm in self.values():
             arm.guide.anneal(**shares)
 
-    def joined(self, action: Any) -> Any:
+    def joined(self, action: Any, num_envs: int) -> Any:
         """One action of a dictionary: of its `action` beside a `control_mode`, or of the parts by robot, one after the
         other; everything else as it is.
 
+        Args:
+            action: as `DoraEnv.step` takes it.
+            num_envs: number of rows of a part; one environment may leave the batch axis out.
+
         Raises:
-            InputError: the control mode is not the present one, or the robots are others.
+            InputError: the control mode is not the present one, the robots are others, or a part does not fit.
         """
         if not isinstance(action, Mapping):
             return action
@@ -94,8 +99,11 @@ class ArmGroup(dict[str, Arm]):
             raise InputError("The action is a dictionary but there is one robot only: pass an array.")
         for known in (names, list(self)):
             if action.keys() == set(known):
-                return torch.cat([as_tensor(action[name], f"The action of {name}") for name in known], -1)
-        raise InputError(f"The action has keys {sorted(action)} but the robots are {names}.")
+                parts = [as_tensor(action[name], f"The action of {name}") for name in known]
+                for name, part, arm in zip(known, parts, self.values(), strict=True):
+                    check_array(part, arm.agent.single_action_space, num_envs, f" of {name}")
+                return torch.cat([part.reshape(num_envs, -1) for part in parts], -1)
+        raise InputError(f"The action has keys {sorted(action, key=str)} but the robots are {names}.")
 
     def commands(self, observed: Snapshot, action: Float[Tensor, "n a"]) -> Any:
         """What ManiSkill's controllers are asked.

@@ -265,10 +265,10 @@ class DoraEnv(BaseEnv):
         """
         if mend(self):
             self._snapshot = None
-        return super().step(action)
+        return super().step(self.arms.joined(action, self.num_envs))
 
     def _step_action(self, action: Any) -> Any:
-        action = checked_action(self.arms.joined(action), self.single_action_space, self.num_envs, self.device)
+        action = checked_action(action, self.single_action_space, self.num_envs, self.device)
         step = self._elapsed_steps
         self.task.remember(self.snapshot)
         self.perturbations.remember(self.observed)
