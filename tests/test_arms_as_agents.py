@@ -205,3 +205,33 @@ print(json.dumps({{
         "steps": 40, "agent": agent, "agents": ["left", "right"], "left": True, "right": False, "again": True,
         "return": True,
     }  # fmt: skip
+
+
+def test_parts_of_an_action_have_to_fit_their_arms():
+    """They are refused in one sentence, and recorded in the order of the arms otherwise, whatever that of the names."""
+    found = in_process("""
+from dora.errors import InputError
+from dora.tasks import make_task
+task = make_task("DoraPair-v1", 3)
+task.reset(seed=0)
+sizes = {name: arm.action_size for name, arm in task.arms.items()}
+good = {name: np.full((3, size), 0.1 * k) for k, (name, size) in enumerate(sizes.items())}
+one, two = good
+wrong = [good | {two: good[two][:2]}, good | {two: good[two][:, 1:]}, {1: good[one], "a": good[two]}]
+words = []
+for action in wrong:
+    try:
+        task.step(action)
+    except InputError as error:
+        words.append(str(error))
+task.step(dict(reversed(good.items())))
+parts = task.scene.px.guard._history[-1].action
+joined = np.concatenate(list(good.values()), 1)
+print(json.dumps([words, len(task.scene.px.guard._history), bool(np.allclose(parts, joined))]))
+""")
+    (rows, width, names), steps, alike = found
+    assert "has shape (2, " in rows
+    assert "is needed" in rows
+    assert "is needed" in width
+    assert "has keys [1, 'a']" in names
+    assert (steps, alike) == (1, True)

@@ -198,9 +198,52 @@ def test_last_states_are_written_to_few_files(folder: Path, monkeypatch: pytest.
         assert record["actions"].shape == (k - 1, 8)
         assert (record["actions"][:-1] == 0.25).all()
     for number in range(2 * records.MOST_IN_FOLDER):
-        records._numbers = iter([1000 + number])
+        monkeypatch.setattr(records, "_numbers", iter([1000 + number]))
         records.StateRecorder().write(records.Record(0, [b""], [b""], [], []))
     assert len(list(folder.iterdir())) == records.MOST_IN_FOLDER
+    env.close()
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda action: action.bfloat16(),
+        lambda action: action.numpy().astype(">f8"),
+        lambda action: action.tolist(),
+        lambda action: {"control_mode": "pd_joint_delta_pos", "action": action},
+    ],
+)
+def test_actions_of_any_form_are_in_the_record(form: Callable[[torch.Tensor], Any], folder: Path):
+    env = make("PickCube-v1", control_mode="pd_joint_delta_pos")
+    env.step(form(zero(env) + 0.25))
+    with pytest.raises(InputError):
+        env.step(form(zero(env) + np.nan))
+    SPOIL["velocity is NaN"](env)
+    env.scene.px.invalidate()
+    assert env.step(form(zero(env) + 0.5))[4]["nonfinite"].tolist() == [False, True, False]
+    assert not env.step(form(zero(env)))[4]["nonfinite"].any()
+    (file,) = folder.iterdir()
+    with np.load(file) as record:
+        assert record["actions"].tolist() == [[0.25] * 8]
+    env.close()
+
+
+def test_an_environment_is_put_back_whatever_happens_to_its_record(monkeypatch: pytest.MonkeyPatch):
+    env = make("PickCube-v1")
+    env.step(zero(env))
+
+    def fail(self: Any) -> Any:
+        raise TypeError("no record")
+
+    monkeypatch.setattr(records.Record, "arrays", fail)
+    spoil(env, "place is NaN")
+    assert not env.step(zero(env))[4]["nonfinite"].any()
+    monkeypatch.setattr(env.scene.px.guard.recorder, "write", fail)
+    SPOIL["place is NaN"](env)
+    env.scene.px.invalidate()
+    with pytest.raises(TypeError, match=r"no record|argument"):
+        env.step(zero(env))
+    assert env.get_state().isfinite().all()
     env.close()
 
 

@@ -1,9 +1,8 @@
 """Environments whose simulation is not finite or blows up: they are found, recorded and put back to a good state."""
 
-import copy
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from dora.sim.batch.layout import Layout, StateIndex
-from dora.sim.batch.records import Record, StateRecorder
+from dora.sim.batch.records import Record, StateRecorder, action_rows
 from dora.sim.batch.stepping import Stepper
 
 SPEED = 1e3
@@ -32,12 +31,13 @@ Step = tuple[Any, Tensor, Tensor, Tensor, dict[str, Any]]
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """Packed states and poses of all environments before a control step, its action, and which of them are good."""
+    """Packed states and poses of all environments before a control step, which of them are good, and its action as of
+    `action_rows`."""
 
     state: list[bytes]
     poses: list[bytes]
-    action: Any
     good: np.ndarray
+    action: np.ndarray | None = None
 
 
 class StateGuard:
@@ -58,6 +58,7 @@ class StateGuard:
         self._systems: list[Any] = [scene.physx_system for scene in scenes]
         self._stepper = stepper
         self._history: deque[Moment] = deque(maxlen=HISTORY)
+        self._next: tuple[Moment, Any] | None = None
         self._layout = Layout({}, {})
         self._limited: list[tuple[Callable[[], np.ndarray], np.ndarray, np.ndarray, float]] = []
 
@@ -70,6 +71,7 @@ class StateGuard:
             index: indices in the packed state.
         """
         self._history.clear()
+        self._next = None
         self._layout = layout
         free = np.array([row.is_link or not row.body.kinematic for row in layout.bodies], bool)
         moving = free[: layout.actor_rows]
@@ -84,15 +86,21 @@ class StateGuard:
         ]
 
     def begin(self, action: Any) -> None:
-        """Take note of the states before a control step, after putting back those that are bad already.
+        """Look at the states before a control step, after putting back those that are bad already.
 
         Args:
-            action: of the step, for the record.
+            action: of the step, for the record; it is looked at by `accept`.
         """
         bad = self.check()
         good = ~self._bad() if bad.any() else ~bad  # an environment that was never good stays bad
-        action = action.clone() if isinstance(action, Tensor) else copy.copy(action)  # it may be changed later
-        self._history.append(Moment(self._stepper.state.chunks(), self._stepper.poses.chunks(), action, good))
+        self._next = Moment(self._stepper.state.chunks(), self._stepper.poses.chunks(), good), action
+
+    def accept(self) -> None:
+        """Take note of the states and the action of the step that has begun: the action is a good one."""
+        if self._next is not None:
+            moment, action = self._next
+            self._history.append(replace(moment, action=action_rows(action, len(self._systems))))
+            self._next = None
 
     def check(self) -> Bool[np.ndarray, " n"]:
         """Put back the environments whose state is bad now, and return which they are."""
@@ -104,6 +112,8 @@ class StateGuard:
         self.found |= bad
         for environment in np.flatnonzero(bad).tolist():
             self._put_back(environment)
+        for environment in np.flatnonzero(bad).tolist():
+            self._record(environment)
         self._stepper.refresh()
         return bad
 
@@ -127,7 +137,6 @@ class StateGuard:
 
     def _put_back(self, environment: int) -> None:
         """Give an environment its last good state, if it had one."""
-        self._record(environment)
         moment = next((m for m in reversed(self._history) if m.good[environment]), None)
         if moment is not None:
             self._systems[environment].unpack(moment.state[environment])
@@ -138,12 +147,13 @@ class StateGuard:
         self._stepper.discard(environment)
 
     def _record(self, environment: int) -> None:
+        """Write the last states of an environment, the bad one as it was read before it was put back."""
         if self.recorder.full:
             return
         now = self._stepper.state.chunks(), self._stepper.poses.chunks()
         states = [m.state[environment] for m in self._history] + [now[0][environment]]
         poses = [m.poses[environment] for m in self._history] + [now[1][environment]]
-        actions = [m.action for m in self._history]
+        actions = [None if m.action is None else m.action[environment] for m in self._history]
         entities = [entity.name for entity in self._scenes[environment].entities]
         self.recorder.write(Record(environment, states, poses, actions, entities))
 

@@ -211,6 +211,7 @@ def _step_action(original: Callable) -> Callable:
             action = finite_rows(action, system.guard.found)
         action = plain_action(action, self.device)
         check_action(self, action)
+        system.guard.accept()
         hooks = ("_before_simulation_step", "_after_simulation_step")
         watched = any(_is_overridden(self, hook) for hook in hooks)
         system.defer(0 if watched else self._sim_steps_per_control)

@@ -3,16 +3,17 @@
 import io
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from jaxtyping import Float
 from mani_skill import logger
 
-from dora.errors import RECORDS, InputError
+from dora.arguments import as_tensor
+from dora.errors import RECORDS
 from dora.files import write_bytes
 from dora.sim.batch.packed import POSE_FLOATS, POSE_ORDER
 
@@ -30,14 +31,14 @@ class Record:
 
     environment: its index.
     states, poses: as SAPIEN packs them, in order of time.
-    actions: of all environments, one per control step; None where it was no array.
+    actions: its rows (a,), one per control step; None where there was none.
     entities: names of the entities, in the order of `poses`.
     """
 
     environment: int
     states: Sequence[bytes]
     poses: Sequence[bytes]
-    actions: Sequence[Any]
+    actions: Sequence[np.ndarray | None]
     entities: Sequence[str]
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -46,7 +47,7 @@ class Record:
         unknown."""
         poses = np.stack([np.frombuffer(p, np.float32).reshape(-1, POSE_FLOATS)[:, POSE_ORDER] for p in self.poses])
         states = np.stack([np.frombuffer(s, np.float32) for s in self.states])
-        rows = [_row(action, self.environment) for action in self.actions]
+        rows = [np.zeros(0, np.float32) if action is None else action for action in self.actions]
         width = max((row.size for row in rows), default=0)
         actions = np.full((len(rows), width), np.nan, np.float32)
         for k, row in enumerate(rows):
@@ -55,12 +56,23 @@ class Record:
         return dict(environment=np.array(self.environment), entities=names, poses=poses, states=states, actions=actions)
 
 
-def _row(action: Any, environment: int) -> np.ndarray:
-    """One environment's part of an action, flat; empty if it is no array of all environments."""
-    if not isinstance(action, np.ndarray | torch.Tensor) or action.ndim < 2 or len(action) <= environment:
-        return np.zeros(0, np.float32)
-    with np.errstate(over="ignore"):
-        return np.asarray(torch.as_tensor(action[environment]).detach().cpu(), np.float32).ravel()
+def action_rows(action: Any, environments: int) -> Float[np.ndarray, "n a"] | None:
+    """A copy of an action as a record holds it: a flat row for each environment; None if it is none, or has no rows.
+
+    Parts of a dictionary by robot come one after the other in the order of their names.
+    """
+    try:
+        if action is None:
+            return None
+        if isinstance(action, Mapping):
+            names = ["action"] if "control_mode" in action else sorted(action)
+            parts = [as_tensor(action[name], "The action") for name in names]
+        else:
+            parts = [as_tensor(action, "The action")]
+        rows = [part.float().reshape(environments, -1).numpy(force=True) for part in parts]
+        return np.concatenate(rows, 1)
+    except Exception:  # a record without actions is better than none
+        return None
 
 
 class StateRecorder:
@@ -77,17 +89,19 @@ class StateRecorder:
     def write(self, record: Record) -> None:
         """Write a record into the folder, as `<process>-<number>.npz`; what goes wrong is logged."""
         self._written += 1
-        folder = Path(os.environ.get(RECORDS) or Path(tempfile.gettempdir()) / FOLDER)
         said = f"The simulation of environment {record.environment} is not finite or blew up: it was put back and its"
+        folder = os.environ.get(RECORDS)
         try:
+            folder = Path(folder or Path(tempfile.gettempdir()) / FOLDER)
             folder.mkdir(parents=True, exist_ok=True)
             path = folder / f"{os.getpid()}-{_next_number()}.npz"
             stream = io.BytesIO()
             np.savez_compressed(stream, **record.arrays())  # pyright: ignore[reportArgumentType]
             write_bytes(path, stream.getvalue())
             _remove_oldest(folder)
-        except (OSError, InputError, ValueError) as error:
-            logger.warning(f"{said} episode ended; its last states could not be written to {folder} ({error}).")
+        except Exception as error:  # whatever it is, the simulation goes on
+            where = folder or "temporary files"
+            logger.warning(f"{said} episode ended; its last states could not be written to {where} ({error}).")
             return
         if self._written == 1:
             logger.warning(f"{said} episode ended; its last states are in {path}. Further ones are only counted.")
