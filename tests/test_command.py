@@ -1,6 +1,8 @@
 """The command `dora`: help at once, one word per command, completion, and registration when it is needed."""
 
+import re
 import resource
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -124,18 +126,39 @@ def test_without_maniskill_one_sentence_says_how_to_add_it():
     assert "ManiSkillMissingError: ManiSkill is not installed" in imported.stderr.splitlines()[-1]
 
 
-def test_bash_completes_a_command_and_an_option(capsys: pytest.CaptureFixture[str], tmp_path: Path):
-    assert command.main(["--completion", "bash"]) == 0
-    path = tmp_path / "dora.bash"
-    path.write_text(capsys.readouterr().out)
-    for typed, wanted in ((("gr",), "grasps"), (("run", "--zero"), "--zero-correction"), (("bench", "ph"), "physics")):
-        words = " ".join(("dora", *typed))
-        ask = (
-            f"source {path}; COMP_WORDS=({words}); COMP_CWORD={len(typed)}; COMP_LINE='{words}'; "
-            "COMP_POINT=${#COMP_LINE}; $(complete -p dora | sed 's/.*-F \\([^ ]*\\).*/\\1/'); "
-            'printf "%s\\n" "${COMPREPLY[@]}"'
-        )
-        assert wanted in run("bash", "-c", ask).stdout.split()
+@pytest.fixture(scope="module")
+def bash_script(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The script that completes in bash."""
+    path = tmp_path_factory.mktemp("completion") / "dora.bash"
+    path.write_text(run(*MODULE, "--completion", "bash").stdout)
+    return path
+
+
+def completed(script: Path, *typed: str) -> list[str]:
+    """What bash offers in the place of the last word."""
+    words = " ".join(shlex.quote(word) for word in ("dora", *typed))
+    ask = (
+        f"source {script}; COMP_WORDS=({words}); COMP_CWORD={len(typed)}; COMP_LINE={shlex.quote(words)}; "
+        "COMP_POINT=${#COMP_LINE}; $(complete -p dora | sed 's/.*-F \\([^ ]*\\).*/\\1/'); "
+        'printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    return run("bash", "-c", ask).stdout.split()
+
+
+@pytest.mark.parametrize(
+    ("typed", "wanted"), [(("gr",), "grasps"), (("run", "--zero"), "--zero-correction"), (("bench", "ph"), "physics")]
+)
+def test_bash_completes_a_command_and_an_option(bash_script: Path, typed: tuple[str, ...], wanted: str):
+    assert wanted in completed(bash_script, *typed)
+
+
+def test_bash_completes_every_measurement_of_bench(bash_script: Path, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        command.main(["bench", "--help"])
+    listed = re.search(r"dora bench \[-h\] \{([\w,]+)\}", capsys.readouterr().out)
+    assert listed is not None
+    offered = {word for word in completed(bash_script, "bench", "") if not word.startswith("-")}
+    assert offered == set(listed[1].split(","))
 
 
 def test_completion_of_an_unknown_shell_is_refused(capsys: pytest.CaptureFixture[str]):

@@ -17,10 +17,7 @@ from dora.tools import env_benchmark as benchmark
 from dora.tools import grasp_benchmark
 from dora.tools import physics_benchmark as task_physics
 
-app = tyro.extras.SubcommandApp()
 
-
-@app.command(name="env")
 def bench_env(
     env: str = "PickCube-v1",
     num_envs: int = 256,
@@ -42,7 +39,6 @@ def bench_env(
     report(dataclasses.asdict(benchmark.measure(env, num_envs, workers, seconds, obs_mode)), json)
 
 
-@app.command(name="grasp")
 def bench_grasp(object: str = "cube", robot: str = "diana7_hit", json: bool = False) -> None:
     """Grasp candidates per second on one core, against plain pytorch_kinematics and trimesh.
 
@@ -54,7 +50,6 @@ def bench_grasp(object: str = "cube", robot: str = "diana7_hit", json: bool = Fa
     report(dataclasses.asdict(grasp_benchmark.measure(object, load_robot(robot))), json)
 
 
-@app.command(name="learner")
 def bench_learner(env: str = "DoraCube-v1", agent: str = "ppo", seconds: float = 5.0, json: bool = False) -> None:
     """Gradient steps per second of a learner with a task's recommended settings, against the same in plain torch.
 
@@ -76,7 +71,6 @@ PHYSICS = ("120:10:8", "240:2:8", "240:3:6", "240:5:4", "240:5:8", "240:10:4", "
 """Default physics settings: rate [Hz], contact offset [mm], position iterations."""
 
 
-@app.command(name="physics")
 def bench_physics(
     env: str = "DoraHammer-v1",
     settings: tuple[str, ...] = PHYSICS,
@@ -113,8 +107,12 @@ def report(result: dict, as_json: bool) -> None:
         print_table(("what", "value"), [(name, str(value)) for name, value in result.items()])
 
 
+KINDS = {"env": bench_env, "grasp": bench_grasp, "learner": bench_learner, "physics": bench_physics}
+"""What `dora bench NAME` does."""
+
+
 @command
 def main() -> int:
     """Run the command; returns the exit status."""
-    app.cli(description=__doc__)
+    tyro.extras.subcommand_cli_from_dict(KINDS, description=__doc__)
     return 0

@@ -52,7 +52,7 @@ def _run_default() -> dict[str, Any]:
 
 def _bench() -> Any:
     """Options of `dora bench` with its own commands."""
-    return _choice({"env": bench.bench_env, "grasp": bench.bench_grasp, "physics": bench.bench_physics})
+    return _choice(bench.KINDS)
 
 
 FORMS = {
