@@ -48,9 +48,12 @@ Examples: dora play DoraHammer-v1
 
 
 def start(words: Sequence[str] | None = None) -> int:
-    """As `main` in a process of its own, which Ctrl-C and SIGTERM end with a line, also while it imports."""
+    """As `main` in a process of its own, which Ctrl-C and SIGTERM end with a line, also while it imports.
+
+    Nor is there a traceback where nobody reads what it prints.
+    """
     quiet_start.begin()
-    return main(words, quiet_start.call)
+    return quiet_start.printing(lambda: main(words, quiet_start.call))
 
 
 def main(words: Sequence[str] | None = None, around: Callable[[Callable[[], int]], int] = operator.call) -> int:

@@ -1,11 +1,18 @@
-"""Ctrl-C and SIGTERM end a command with one line, also while what does its work is still being imported."""
+"""Ctrl-C and SIGTERM end a command with one line, also while what does its work is still being imported.
+
+A reader of its output that goes away, as `head` does, ends it without any.
+"""
 
 import os
+import select
 import signal
+import sys
 from collections.abc import Callable
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Signals that end a command."""
+UNREAD = 128 + signal.SIGPIPE
+"""Exit status when nobody reads what a command prints."""
 
 
 def _end(number: int, frame: object) -> None:
@@ -36,3 +43,27 @@ def call(main: Callable[[], int]) -> int:
     finally:
         for number in SIGNALS:  # the command is done, the interpreter only cleans up
             signal.signal(number, signal.SIG_IGN)
+
+
+def printing(main: Callable[[], int]) -> int:
+    """Exit status of a command that prints; without a traceback where nobody reads it any more."""
+    try:
+        try:
+            return main()
+        finally:
+            if sys.stdout is not None:  # as after >&-
+                sys.stdout.flush()
+    except BrokenPipeError:
+        if _is_read():
+            raise  # another pipe has broken
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is left to print
+        return UNREAD
+
+
+def _is_read() -> bool:
+    """Whether there is still a reader of the standard output."""
+    if sys.stdout is None:
+        return True
+    output = select.poll()
+    output.register(sys.stdout.fileno(), 0)
+    return not any(event & (select.POLLERR | select.POLLHUP) for _, event in output.poll(0))

@@ -1,5 +1,6 @@
 """The command `dora`: help at once, one word per command, completion, and registration when it is needed."""
 
+import os
 import re
 import resource
 import shlex
@@ -11,6 +12,7 @@ import pytest
 
 from dora import __main__ as command
 from dora import errors
+from dora.quiet_start import UNREAD, printing
 from dora.version import source_commit, version_line
 
 HELP_SECONDS = 0.5
@@ -80,6 +82,29 @@ def test_a_typo_gets_a_suggestion(capsys: pytest.CaptureFixture[str], typed: str
 def test_without_a_command_the_usage_is_shown(capsys: pytest.CaptureFixture[str]):
     assert command.main([]) == command.BAD_INPUT
     assert "usage: dora COMMAND" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"], ids=["buffered", "unbuffered"])
+@pytest.mark.parametrize("words", [("--help",), ("play", "--help")], ids=" ".join)
+def test_a_reader_that_goes_away_ends_it_without_a_traceback(words: tuple[str, ...], unbuffered: str):
+    """As `dora play --help | head -1`; here nobody reads from the beginning, so that each write fails."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    done = subprocess.run([*MODULE, *words], stdout=writing, stderr=subprocess.PIPE, text=True, env=environment)
+    os.close(writing)
+    assert done.returncode == UNREAD
+    assert "Traceback" not in done.stderr
+    assert "BrokenPipeError" not in done.stderr
+
+
+def test_a_pipe_of_something_else_that_breaks_is_told(capfd: pytest.CaptureFixture[str]):
+    with pytest.raises(BrokenPipeError, match="of a worker"):
+        printing(_broken)
+
+
+def _broken() -> int:
+    raise BrokenPipeError("of a worker")
 
 
 def test_a_command_runs_in_any_folder(tmp_path: Path):
