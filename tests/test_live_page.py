@@ -249,7 +249,7 @@ def test_a_film_without_a_driver_is_refused_in_one_sentence(
     path = tmp_path / "film.mp4"
     assert call(command, monkeypatch, "DoraCube-v1", "--video", str(path)) == 2
     assert capsys.readouterr().err == (
-        "No film: SAPIEN finds no Vulkan driver here (docs/rendering.md); the page needs none.\n"
+        "No film: SAPIEN finds no Vulkan driver here (docs/rendering.md in the project); the page needs none.\n"
     )
     assert not path.exists()
 

@@ -96,6 +96,17 @@ def test_constants_are_documented_below_them(path: Path) -> None:
     assert not found, "\n".join(f"{path.relative_to(ROOT)}:{name}" for name in found)
 
 
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_words_of_the_package_name_a_script_that_a_wheel_lacks(path: Path) -> None:
+    """Help and messages say `dora run` and the like; experiments/ is in a checkout only."""
+    found = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and "experiments" in node.value
+    ]
+    assert not found, "\n".join(found)
+
+
 def named(text: str) -> list[str]:
     """Dotted names below `dora` and paths below `dora/`, `tests/` and the like on a page, without placeholders."""
     dotted = re.findall(r"(?<![\w/.-])dora(?:\.\w+)+(?!\w*/)", text)

@@ -77,6 +77,6 @@ def load_candidates(
         option = "" if region else " --any-region"
         raise InputError(
             f"the object {str(name)!r} has no grasps ({path}): "
-            f"make them with python experiments/grasps.py --object {name} --make-bundle{option}."
+            f"make them with `dora grasps --object {name} --make-bundle{option}`."
         )
     return GraspCandidates.load(path, load_object(name), robot or load_robot(ROBOT))

@@ -208,8 +208,7 @@ class GraspCandidates:
             )
         if object is not None and self.digest != object.digest:
             raise InputError(
-                f"{path} was made for another shape or labelling of {object.name!r}: "
-                "make it again with experiments/grasps.py."
+                f"{path} was made for another shape or labelling of {object.name!r}: make it again with `dora grasps`."
             )
         if robot is not None and self.robot != robot.name:
             raise InputError(
@@ -217,8 +216,7 @@ class GraspCandidates:
             )
         if robot is not None and self.robot_digest != hand_digest(robot):
             raise InputError(
-                f"{path} was made for another version of the hand of {robot.name!r}: "
-                "make it again with experiments/grasps.py."
+                f"{path} was made for another version of the hand of {robot.name!r}: make it again with `dora grasps`."
             )
 
 

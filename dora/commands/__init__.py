@@ -1,1 +1,1 @@
-"""The bodies of the commands: what `experiments/*.py` call. Stands above everything."""
+"""The bodies of the commands: what `dora NAME` does. Stands above everything."""

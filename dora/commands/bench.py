@@ -1,4 +1,4 @@
-"""Measure how fast the parts of Dora are: python experiments/bench.py env --env PickCube-v1 --json"""
+"""Measure how fast the parts of Dora are: `dora bench env --env PickCube-v1 --json`."""
 
 import dataclasses
 import json

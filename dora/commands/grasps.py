@@ -1,11 +1,11 @@
 """Generate grasps of an object, judge them, and store them.
 
-    python experiments/grasps.py --object jug --num 256 --validate sapien --out runs/jug.safetensors
-    python experiments/grasps.py --object my/mug                 # the folder of an object of your own
-    python experiments/grasps.py --mesh mug.glb --labels mug.yaml --units mm --region handle
+    dora grasps --object jug --num 256 --validate sapien --out runs/jug.safetensors
+    dora grasps --object my/mug                 # the folder of an object of your own
+    dora grasps --mesh mug.glb --labels mug.yaml --units mm --region handle
 
 Prints a table with baselines beside it (searches without E_DFC, without closing the hand around the object, and of one
-iteration), and writes OUT (safetensors) and a .json beside it. `experiments/view.py OUT` shows the grasps.
+iteration), and writes OUT (safetensors) and a .json beside it. `dora view OUT` shows the grasps.
 """
 
 import sys
@@ -56,7 +56,8 @@ class Args:
     mesh: Path | None = None
     """Your own mesh: OBJ, STL, PLY or GLB, closed or nearly so."""
     labels: Path | None = None
-    """Regions of --mesh: a file with one label per face, or a YAML of boxes and planes (docs/objects.md)."""
+    """Regions of --mesh: a file with one label per face, or a YAML of boxes and planes (docs/objects.md in
+    the project)."""
     num: int = 256
     """Candidates to search for."""
     seed: int = 0
@@ -68,7 +69,8 @@ class Args:
     units: Literal["m", "cm", "mm", "in"] = "m"
     """Unit of length of --mesh; GLB files are in metres."""
     mass: float | None = None
-    """Mass of --mesh [kg] (default: an estimate from its geometry, which is printed; docs/objects.md has the rule)."""
+    """Mass of --mesh [kg] (default: an estimate from its geometry, which is printed; docs/objects.md in the
+    project has the rule)."""
     density: float | None = None
     """Density of the material of --mesh [kg/m^3], in the place of --mass."""
     robot: str = "diana7_hit"

@@ -69,8 +69,8 @@ def left_behind(process: int) -> frozenset[str]:
 
 
 def command(*options: str) -> list[str]:
-    """The command line of `run.py` of this checkout."""
-    return [sys.executable, str(Path(__file__).parents[2] / "experiments" / "run.py"), *options]
+    """The command line of `dora run`."""
+    return [sys.executable, "-m", "dora", "run", *options]
 
 
 def wait_for(path: Path, process: subprocess.Popen[str]) -> None:

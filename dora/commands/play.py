@@ -112,7 +112,9 @@ def film(args: Args, player: Player) -> Path:
         raise InputError("--video films a policy: leave out --recording, or --video to watch it on the page.")
     logging.getLogger("mani_skill").setLevel(logging.ERROR)  # the sentence below says what its note says
     if not can_render():
-        raise InputError("No film: SAPIEN finds no Vulkan driver here (docs/rendering.md); the page needs none.")
+        raise InputError(
+            "No film: SAPIEN finds no Vulkan driver here (docs/rendering.md in the project); the page needs none."
+        )
     make_folder(args.video.parent)
     make = functools.partial(
         make_task, args.env, 1, sim_backend="physx_cpu", render_mode="rgb_array", **player.options_with(args.preset)

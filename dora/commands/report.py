@@ -1,4 +1,4 @@
-"""Tables and figures of finished runs: `python experiments/report.py DIR`."""
+"""Tables and figures of finished runs: `dora report DIR`."""
 
 from dataclasses import dataclass
 from pathlib import Path

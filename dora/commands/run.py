@@ -1,9 +1,9 @@
 """Train or evaluate a learner on a Dora task.
 
-    python experiments/run.py --env DoraCube-v1
-    python experiments/run.py --env DoraCube-v1 --task.lift 0.12 --learner.gamma 0.97
-    python experiments/run.py --eval-only --checkpoint FOLDER --seed 1 --episodes 50 --video
-    python experiments/run.py --eval-only --zero-correction --env DoraCube-v1
+    dora run --env DoraCube-v1
+    dora run --env DoraCube-v1 --task.lift 0.12 --learner.gamma 0.97
+    dora run --eval-only --checkpoint FOLDER --seed 1 --episodes 50 --video
+    dora run --eval-only --zero-correction --env DoraCube-v1
 
 Trains with the recommended settings, evaluates the best policy on fixed seeds and writes a run folder, whose
 path is the last line printed. Ctrl-C saves; `--resume FOLDER` goes on. Every number of the task and of the learner is

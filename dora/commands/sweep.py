@@ -1,9 +1,9 @@
 """Train all runs of a table, one after the other, and go on where an earlier call stopped.
 
-    python experiments/sweep.py --preset paper --dry-run
-    python experiments/sweep.py --preset paper
-    python experiments/sweep.py --preset paper --env DoraCube-v1 --seeds 10
-    python experiments/sweep.py --preset paper --launcher ray
+    dora sweep --preset paper --dry-run
+    dora sweep --preset paper
+    dora sweep --preset paper --env DoraCube-v1 --seeds 10
+    dora sweep --preset paper --launcher ray
 
 A finished run counts, whichever command made it, if its settings are the same and its result lies under --out or
 --known. Ctrl-C saves; the same command goes on.

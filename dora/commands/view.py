@@ -1,12 +1,12 @@
 """Show an object, its regions and its grasps on a web page.
 
-    python experiments/view.py jug                                  # an object with its bundled grasps
-    python experiments/view.py runs/grasps/jug.safetensors          # what experiments/grasps.py wrote
-    python experiments/view.py my/mug                               # the folder of an object of your own
-    python experiments/view.py mug.glb --labels mug.yaml            # the regions of your own mesh
-    python experiments/view.py runs/grasps/mug.safetensors --mesh mug.glb --labels mug.yaml
-    python experiments/view.py jug --pictures runs/pictures         # PNG files instead of a page
-    python experiments/view.py --pictures runs/pictures             # one PNG of all objects
+    dora view jug                                  # an object with its bundled grasps
+    dora view runs/grasps/jug.safetensors          # what dora grasps wrote
+    dora view my/mug                               # the folder of an object of your own
+    dora view mug.glb --labels mug.yaml            # the regions of your own mesh
+    dora view runs/grasps/mug.safetensors --mesh mug.glb --labels mug.yaml
+    dora view jug --pictures runs/pictures         # PNG files instead of a page
+    dora view --pictures runs/pictures             # one PNG of all objects
 
 Runs until Ctrl-C.
 """
@@ -50,7 +50,7 @@ class Args:
     mesh: Path | None = None
     """Mesh, or folder of the object, of a file of grasps whose object has no name in objects/ or DORA_OBJECTS."""
     labels: Path | None = None
-    """Regions of the mesh, as for experiments/grasps.py."""
+    """Regions of the mesh, as for `dora grasps`."""
     scale: float = 1.0
     """Factor of all lengths of --mesh."""
     units: Literal["m", "cm", "mm", "in"] = "m"

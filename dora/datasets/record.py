@@ -65,7 +65,9 @@ def check_possible(kind: str, plan: Plan, folder: Path, pictures: bool) -> None:
     if pictures and kind == "minari":
         raise InputError("pictures are not written in Minari's format: choose the format lerobot or maniskill.")
     if pictures and not can_render():
-        raise InputError("No pictures: SAPIEN finds no Vulkan driver here (docs/rendering.md); leave pictures out.")
+        raise InputError(
+            "No pictures: SAPIEN finds no Vulkan driver here (docs/rendering.md in the project); leave pictures out."
+        )
     make_folder(folder.absolute().parent)
 
 

@@ -118,8 +118,8 @@ def _render(original: Callable) -> Callable:
         """ManiSkill's, or an InputError where nothing can be drawn."""
         if self.render_mode not in (None, "human") and not self.scene.can_render() and _is_ours(self):
             raise InputError(
-                "nothing can be rendered: SAPIEN finds no Vulkan driver (see docs/rendering.md), or render_backend is "
-                f"{self.backend.render_backend!r}."
+                "nothing can be rendered: SAPIEN finds no Vulkan driver (see docs/rendering.md in the project), or "
+                f"render_backend is {self.backend.render_backend!r}."
             )
         if self.render_mode == "sensors" and _is_ours(self):
             check_shown(self)

@@ -96,7 +96,7 @@ def vote_over_map(
     if contact_map.shape[1] != len(map):
         raise InputError(
             f"the contact maps have {contact_map.shape[1]} points and the affordance map of {map.name} {len(map)}: "
-            "make them anew with experiments/grasps.py --contact-maps."
+            "make them anew with `dora grasps --contact-maps`."
         )
     _, near = map.nearest(map.points, settings.neighbours)
     around = torch.nn.functional.one_hot(near, len(map.names)).sum(1).to(map.points)

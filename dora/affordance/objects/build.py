@@ -38,13 +38,14 @@ class Args:
     mesh: Path | None = None
     """Your own mesh instead of a model: OBJ, STL, PLY or GLB, closed or nearly so."""
     labels: Path | None = None
-    """Regions of --mesh: a file with one label per face, or a YAML of boxes and planes (docs/objects.md)."""
+    """Regions of --mesh: a file with one label per face, or a YAML of boxes and planes (docs/objects.md in
+    the project)."""
     units: Literal["m", "cm", "mm", "in"] = "m"
     """Unit of length of --mesh; GLB files are in metres."""
     scale: float = 1.0
     """Factor of all lengths of --mesh."""
     mass: float | None = None
-    """Mass of --mesh [kg] (default: an estimate from its geometry; docs/objects.md has the rule)."""
+    """Mass of --mesh [kg] (default: an estimate from its geometry; docs/objects.md in the project has the rule)."""
     density: float | None = None
     """Density of the material of --mesh [kg/m^3], in the place of --mass."""
 

@@ -14,7 +14,10 @@ from dora.errors import InputError
 
 QUIET, USUAL = "off", "warn"
 """Levels of SAPIEN's log of rendering: nothing, and what it is when SAPIEN is imported."""
-NOTE = "There is no Vulkan driver: everything works but pictures and films (docs/rendering.md says how to get one)."
+NOTE = (
+    "There is no Vulkan driver: everything works but pictures and films (docs/rendering.md in the project says how to "
+    "get one)."
+)
 """What is said once instead of the three lines that SAPIEN logs where it finds no driver."""
 STATE_MODES = ("state", "state_dict", "none")
 """Observation modes that need no renderer; others may join them with "+"."""
@@ -71,7 +74,7 @@ def refuse_pictures(obs_mode: str | None, render_mode: str | None) -> NoReturn:
     if can_render():
         why, mend = "render_backend is 'none'", "leave render_backend out"
     else:
-        why, mend = "SAPIEN finds no Vulkan driver", "install one, such as Mesa's (docs/rendering.md)"
+        why, mend = "SAPIEN finds no Vulkan driver", "install one, such as Mesa's (docs/rendering.md in the project)"
     raise InputError(
         f'{wish} needs pictures, but {why}: {mend}, or use obs_mode "state" and no render_mode, which need none.'
     )
