@@ -15,8 +15,8 @@ EQUATION = re.compile(r'<(?P<tag>div|span) class="arithmatex">\\[(\[](?P<tex>.*?
 GLANCE = "<!-- results at a glance -->"
 """Mark of the place for the table of results, in the pages that show one."""
 COLUMNS = {
-    "task": "task", "preset": "preset", "agent": "agent", "guidance": "guidance", "seeds": "seeds", "success %": "success %",
-    "scripted (zero correction) %": "scripted %", "minutes": "minutes",
+    "task": "task", "preset": "preset", "agent": "agent", "guidance": "guidance", "seeds": "seeds",
+    "success %": "success %", "scripted (zero correction) %": "scripted %", "minutes": "minutes",
 }  # fmt: skip
 """Columns that are shown there, and how they are called."""
 NOTEBOOK = Path("examples/tour.ipynb")
