@@ -14,7 +14,6 @@ pushing on after a touch does not count.
 """
 
 import math
-
 from dataclasses import dataclass
 
 import numpy as np
