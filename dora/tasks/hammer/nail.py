@@ -8,7 +8,7 @@ down, so that it never comes back up: while the nail moves,
 
 The hammer's blow starts the nail at nearly the hammer's speed and is then spent against drag and resistance. Pushing
 moves it too, and a nail pushed in has not been hammered: a blow is an impact above `blow_speed` of the striking face on
-the nail's head. What the nail sinks within `blow_window` after one counts as driven, while nothing but that face presses
+the nail's head. What the nail sinks within `blow_window` after one counts as driven while nothing but that face presses
 on the nail, and no more of it than the momentum of the hammer alone could drive (`free_depth`): what the hand adds by
 pushing on after a touch does not count.
 """
