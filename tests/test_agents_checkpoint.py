@@ -13,6 +13,7 @@ from tensordict import TensorDict
 
 from dora.agents.checkpoint import Checkpoint, check_belongs, read_checkpoint
 from dora.agents.config import RunConfig
+from dora.agents.counters import checked_counters
 from dora.agents.learners import replay as replay_module
 from dora.agents.learners.replay import Replay
 from dora.errors import InputError
@@ -52,6 +53,44 @@ def test_damaged_files_are_refused(path: Path, tmp_path: Path):
             read_checkpoint(path)
     with pytest.raises(InputError, match="There is no checkpoint"):
         read_checkpoint(tmp_path / "missing.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("curve", 3, "curve must be"),
+        ("curve", [[10**400, 2.0, 0.5]], "curve has to be rows"),
+        ("curve", [[1, 2.0, "much"]], "curve has to be rows"),
+        ("curve", [[-1, 2.0, 0.5]], "curve has to be rows"),
+        ("env_steps", -1, "env_steps is -1"),
+        ("env_steps", "many", "env_steps must be int"),
+        ("env_steps", True, "env_steps has to be a number"),
+        ("wall_seconds", float("nan"), "wall_seconds is nan"),
+        ("episodes", 10**13, "episodes is 1"),
+        ("best", [0.5], "best has to be a success rate and a return"),
+        ("best", [1.5, 3.0], "best has to be a success rate and a return"),
+        ("seconds", {"collect": 1.0}, "seconds has to be"),
+        ("learner", {"added": 10**400}, "learner has to be finite numbers"),
+        ("learner", {"added": "all"}, "learner has to be finite numbers"),
+        ("learner", [3], "learner has to be finite numbers"),
+        ("epochs", 3, "there is no 'epochs'"),
+    ],
+)
+def test_counters_of_a_wrong_type_or_size_are_refused(path: Path, name: str, value: object, words: str):
+    Checkpoint(CONFIG, (4, 2), {}, {name: value}).write(path)
+    with pytest.raises(InputError, match=f"the counters in {path}") as caught:
+        read_checkpoint(path)
+    assert words in str(caught.value)
+
+
+def test_counters_of_every_kind_are_read(path: Path):
+    nan = float("nan")
+    progress = {"env_steps": 9, "wall_seconds": 2, "best": [1, -3.5], "curve": [[9, 2, 1.0, -3.5, nan, nan]]}
+    progress |= {"learner": {"due": 0.5}, "reached": 0, "other_seconds": 0.0}
+    Checkpoint(CONFIG, (4, 2), {}, progress).write(path)
+    counters = checked_counters(read_checkpoint(path).progress, path)
+    assert (counters.env_steps, counters.wall_seconds, counters.best) == (9, 2.0, [1.0, -3.5])
+    assert counters.seconds == {"collect": 0.0, "learn": 0.0, "evaluate": 0.0}
 
 
 def test_foreign_checkpoints_are_refused(path: Path):

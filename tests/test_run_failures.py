@@ -5,6 +5,7 @@ import functools
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from dora.agents.checkpoint import read_checkpoint
 from dora.agents.collecting import rollouts
 from dora.agents.collecting.task_env import TaskEnv
 from dora.agents.evaluation.evaluators import Evaluators
+from dora.agents.evaluation.play import load_policy
 from dora.agents.learners.finite import check_loss, check_modules
 from dora.agents.runs.interrupt import IMPATIENT, Interrupt
 from dora.agents.runs.run_folder import RunFolder
@@ -285,6 +287,46 @@ def test_what_is_half_learned_is_not_saved(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(trainer.learner, "update", half)
     assert not trainer.run()["finished"]
     assert read_checkpoint(folder.latest).progress["env_steps"] == 0
+
+
+@pytest.mark.parametrize(
+    "change", [{"seed": 5}, {"learner": dataclasses.replace(SMALL_PPO, gamma=0.9)}], ids=["seed", "gamma"]
+)
+def test_the_best_policy_of_another_run_is_refused(tmp_path: Path, change: Any):
+    run(tmp_path / "run", SHORT)
+    run(tmp_path / "other", dataclasses.replace(SHORT, **change))
+    best = RunFolder(tmp_path / "run").best
+    shutil.copy(RunFolder(tmp_path / "other").best, best)
+    with pytest.raises(InputError, match=f"{best} belongs to another run"):
+        run(tmp_path / "run", SHORT, resume=True)
+
+
+def test_a_missing_best_policy_is_told(tmp_path: Path):
+    run(tmp_path / "run", SHORT)
+    RunFolder(tmp_path / "run").best.unlink()
+    with pytest.raises(
+        InputError, match=r"best\.safetensors is missing, the best policy of this run so far: put it back"
+    ):
+        run(tmp_path / "run", SHORT, resume=True)
+
+
+def spoilt(path: Path, name: str) -> None:
+    """Write a checkpoint again, with NaN in one of its tensors."""
+    checkpoint = read_checkpoint(path)
+    checkpoint.tensors[name].view(-1)[0] = torch.nan
+    checkpoint.write(path)
+
+
+def test_weights_that_are_not_finite_are_refused_with_their_file(tmp_path: Path):
+    run(tmp_path / "run", SHORT)
+    folder, name = RunFolder(tmp_path / "run"), "actor/mean.0.weight"
+    spoilt(folder.best, name)
+    with pytest.raises(InputError, match=f"{folder.best} holds NaN or infinity in {name}"):
+        load_policy(read_checkpoint(folder.best), folder.best)
+    moment = next(key for key in weights(folder.path) if key.endswith("exp_avg"))
+    spoilt(folder.latest, moment)
+    with pytest.raises(InputError, match=f"{folder.latest} holds NaN or infinity in {moment}"):
+        run(folder.path, SHORT, resume=True)
 
 
 def test_only_one_process_trains_in_a_folder(tmp_path: Path):

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from dora.agents.agent_columns import Agents, checked_agents, plain_agents
 from dora.agents.config import RunConfig, config_from_dict, stored_digests
+from dora.agents.counters import checked_counters
 from dora.agents.limits import check
 from dora.configs import plain
 from dora.errors import InputError, shown
@@ -81,6 +82,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         raise InputError(f"{path} has the sizes {shown(sizes)}, not two whole numbers above 0: use another checkpoint.")
     if not isinstance(progress, dict):
         raise InputError(f"{path} has no counters of its run: use another checkpoint.")
+    checked_counters(progress, path)
     config = config_from_dict(settings, f"the settings in {path}")
     if header.get("config_digest") not in stored_digests(settings):
         raise InputError(f"{path} has settings that were changed (their digest differs): use another checkpoint.")
@@ -157,15 +159,27 @@ def pack_modules(modules: dict[str, nn.Module]) -> dict[str, Tensor]:
     return {f"{key}/{n}": v for key, module in modules.items() for n, v in module.state_dict().items()}
 
 
+def check_finite(tensors: dict[str, Tensor], path: Path) -> None:
+    """Refuse tensors of a checkpoint that are not finite.
+
+    Raises:
+        InputError: naming the first.
+    """
+    for name, value in tensors.items():
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            raise InputError(f"{path} holds NaN or infinity in {name}: use an earlier checkpoint, or train again.")
+
+
 def unpack_modules(modules: dict[str, nn.Module], tensors: dict[str, Tensor], path: Path) -> None:
     """Load what `pack_modules` made.
 
     Raises:
-        InputError: if names or shapes differ.
+        InputError: if names or shapes differ, or something is not finite.
     """
     for key, module in modules.items():
         prefix = f"{key}/"
         state = {n.removeprefix(prefix): v for n, v in tensors.items() if n.startswith(prefix)}
+        check_finite({f"{prefix}{n}": v for n, v in state.items()}, path)
         try:
             module.load_state_dict(state)
         except RuntimeError as error:

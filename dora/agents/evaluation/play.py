@@ -32,7 +32,7 @@ def load_policy(checkpoint: Checkpoint, path: Path) -> Policy:
     """The policy of a checkpoint.
 
     Raises:
-        InputError: if its tensors do not fit its settings.
+        InputError: if its tensors do not fit its settings, or are not finite.
     """
     policy = make_learner(checkpoint.config, *checkpoint.sizes, checkpoint.agents).policy
     unpack_modules(policy.modules_by_name, checkpoint.tensors, path)

@@ -4,7 +4,6 @@ import functools
 import os
 import signal
 import time
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from torch import Tensor
 from dora.agents.checkpoint import (
     Checkpoint,
     check_belongs,
+    check_finite,
     pack_modules,
     pack_optimisers,
     pack_rng,
@@ -28,6 +28,7 @@ from dora.agents.checkpoint import (
 from dora.agents.collecting.rollouts import Rollouts
 from dora.agents.collecting.task_env import NONFINITE, EpisodeColumns, MakeTask, ended_episodes
 from dora.agents.config import RunConfig
+from dora.agents.counters import LEARNER, Counters, checked_counters
 from dora.agents.evaluation.evaluate import PERIODIC_SEED, Evaluation, outcome
 from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.finite import check_modules, check_tensors
@@ -37,8 +38,7 @@ from dora.agents.runs.logging import RunLog
 from dora.agents.runs.machine import OtherLoad
 from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.run_folder import RunFolder, make_result
-from dora.configs import built
-from dora.errors import RECORDS, WorkerFailure
+from dora.errors import RECORDS, InputError, WorkerFailure
 from dora.progress import ProgressDisplay
 
 TRAINING_SEEDS = 1_000_000_000
@@ -59,26 +59,6 @@ def seeds_for(seed: int, step: int, count: int) -> list[int]:
     """`count` independent seeds in [0, 1e9), different for every (seed, step)."""
     state = np.random.SeedSequence([seed, step]).generate_state(count, np.uint64)
     return [int(s % TRAINING_SEEDS) for s in state]
-
-
-@dataclass
-class Counters:
-    """Progress of a run: what a checkpoint keeps besides tensors."""
-
-    env_steps: int = 0
-    wall_seconds: float = 0.0
-    episodes: int = 0
-    next_evaluation: int = 0
-    best: list[float] | None = None
-    """Success rate and return of the best evaluation."""
-    reached: int = 0
-    """Successive evaluations that reached `stop_success`."""
-    nonfinite: int = 0
-    """Episodes that ended because their simulation was not finite."""
-    curve: list[list[Any]] = field(default_factory=list)
-    other_seconds: float = 0.0
-    """Processor time that other programs took meanwhile [s]."""
-    seconds: dict[str, float] = field(default_factory=lambda: {"collect": 0.0, "learn": 0.0, "evaluate": 0.0})
 
 
 class Trainer:
@@ -320,15 +300,27 @@ class Trainer:
     def _final_evaluation(self, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
         """Evaluate the best policy, and zero correction, on seeds that did not select it."""
         start = time.perf_counter()
-        if not self.folder.best.exists():
+        if self.counters.best is None:  # there was no evaluation, and what is there is of another run
             self._keep_as_best()
         with torch.random.fork_rng(devices=[]):  # networks of its own: those that learn stay as they are
             policy = make_learner(self.config, *self.sizes, self.agents).policy
-        best = read_checkpoint(self.folder.best)
-        unpack_modules(policy.modules_by_name, best.tensors, self.folder.best)
+        unpack_modules(policy.modules_by_name, self._read_best().tensors, self.folder.best)
         evaluation, zero = self._evaluators.final(policy, interrupt.check, zero=self._zero)
         self._spend("evaluate", time.perf_counter() - start)
         return evaluation, zero
+
+    def _read_best(self) -> Checkpoint:
+        """The checkpoint of the best evaluation of this run.
+
+        Raises:
+            InputError: if it is missing, damaged, or of another run.
+        """
+        path = self.folder.best
+        if not path.exists():
+            raise InputError(f"{path} is missing, the best policy of this run so far: put it back, or start a new run.")
+        best = read_checkpoint(path)
+        check_belongs(best, path, self.config, self.sizes, self.agents, exactly=True)
+        return best
 
     def save(self) -> None:
         """Write the latest checkpoint.
@@ -347,19 +339,21 @@ class Trainer:
             replay.forget_old_files(self.folder.replay)
 
     def _checkpoint(self, tensors: dict[str, Tensor]) -> Checkpoint:
-        progress = dict(vars(self.counters)) | {"learner": self.learner.counters()}
+        progress = dict(vars(self.counters)) | {LEARNER: self.learner.counters()}
         return Checkpoint(self.config, self.sizes, tensors, progress, agents=self.agents)
 
     def _load(self) -> None:
         path = self.folder.latest
         checkpoint = read_checkpoint(path)
         check_belongs(checkpoint, path, self.config, self.sizes, self.agents, exactly=True)
+        check_finite(checkpoint.tensors, path)
         unpack_modules(self.learner.modules, checkpoint.tensors, path)
-        progress = dict(checkpoint.progress)
         with whole(path):
             unpack_optimisers(self.learner.optimisers, checkpoint.tensors)
-            self.learner.set_counters(progress.pop("learner"))
-            self.counters = built(Counters, progress)
+            self.learner.set_counters(checkpoint.progress[LEARNER])
+        self.counters = checked_counters(checkpoint.progress, path)
+        if self.counters.best is not None:
+            self._read_best()
         if self.learner.replay is not None:
             self.learner.replay.load(self.folder.replay, self.config.digest())
         self._resumed = checkpoint.tensors
