@@ -1,5 +1,6 @@
 """The live page shows what its session says and passes on what a person asks; with a browser, if there is one here."""
 
+import contextlib
 import io
 import socket
 import subprocess
@@ -8,6 +9,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,7 @@ from dora.errors import InputError
 from dora.live.orders import Choose, Randomise, Reset, Run, Start
 from dora.live.page import Page
 from dora.live.panel import NEAREST
+from dora.live.players import zero_correction
 from dora.live.scene_view import HIDDEN, LENGTH, LONGEST, ON_HAND, ON_OBJECT, SceneView, arrows
 from dora.live.session import Session
 from dora.live.state import Forces, Poses
@@ -254,6 +257,26 @@ def test_a_film_without_a_driver_is_refused_in_one_sentence(
     assert not path.exists()
 
 
+def test_the_page_ends_with_ctrl_c_which_the_command_reports(monkeypatch: pytest.MonkeyPatch):
+    play, ended = load_command("play"), []
+
+    def interrupted(seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    @contextlib.contextmanager
+    def served(session: Any, port: int, host: str) -> Iterator[Any]:
+        try:
+            yield SimpleNamespace(url="http://127.0.0.1:8080", error=None)
+        finally:
+            ended.append(True)
+
+    monkeypatch.setattr(play, "served", served)
+    monkeypatch.setattr(play, "time", SimpleNamespace(sleep=interrupted))
+    with pytest.raises(KeyboardInterrupt):
+        play.serve(Session("DoraCube-v1", [zero_correction({})], preset="none"), 8080, "127.0.0.1")
+    assert ended == [True]
+
+
 @pytest.mark.slow
 def test_the_command_serves_the_page_until_it_is_interrupted():
     port = free_port()
@@ -267,8 +290,8 @@ def test_the_command_serves_the_page_until_it_is_interrupted():
         with socket.create_connection(("127.0.0.1", port)):
             pass
         process.send_signal(2)
-        process.wait(60)
-        assert process.returncode == 0
+        assert process.communicate(timeout=60)[1].splitlines()[-1] == "Interrupted."
+        assert process.returncode == 130
     finally:
         process.kill()
 

@@ -7,7 +7,7 @@ import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import imageio.v3 as imageio
 import numpy as np
@@ -380,3 +380,21 @@ def test_maps_and_titles_are_those_of_the_chosen_grasps(
     surface = Surface(cube, 0.5)
     for found, row in zip(seen["maps"], rows, strict=True):
         np.testing.assert_array_equal(found, surface.parts(several.contact_map[row]))
+
+
+def test_the_page_ends_with_ctrl_c_which_the_command_reports(monkeypatch: pytest.MonkeyPatch):
+    view, stopped = load_command("view"), []
+
+    class Shown:
+        url = "http://127.0.0.1:8080"
+        server = SimpleNamespace(stop=lambda: stopped.append(True))
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(view, "GraspPage", lambda *_: Shown())
+    waiting = SimpleNamespace(Event=lambda: SimpleNamespace(wait=interrupted))
+    monkeypatch.setattr(view, "threading", waiting)
+    with pytest.raises(KeyboardInterrupt):
+        call(view, monkeypatch, "cube")
+    assert stopped == [True]

@@ -140,14 +140,14 @@ def serve(session: Session, port: int, host: str) -> None:
     """Serve the page until Ctrl-C.
 
     Raises:
+        KeyboardInterrupt: by Ctrl-C, when the page has ended.
         InputError: viser is not installed, or the port is in use.
         RuntimeError: session or page broke down.
     """
     with served(session, port, host) as page:
         print(page.url, flush=True)
-        with contextlib.suppress(KeyboardInterrupt):
-            while session.error is None and page.error is None:
-                time.sleep(LOOK)
+        while session.error is None and page.error is None:
+            time.sleep(LOOK)
         if (error := session.error or page.error) is not None:
             raise RuntimeError(f"the page has ended: {error}") from error
 

@@ -113,6 +113,6 @@ def main() -> int:
     print(page.url, flush=True)
     try:
         threading.Event().wait()
-    except KeyboardInterrupt:
+    finally:
         page.server.stop()
     return 0

@@ -26,11 +26,12 @@ class Interrupt:
     Attributes:
         number: of the signal, None before.
         at_once: whether there was a second one, which may have come at any place of the program.
+        closing: set when nothing is left but to write the result, which no further signal prevents.
     """
 
     def __init__(self) -> None:
         self.number: int | None = None
-        self.at_once = False
+        self.at_once = self.closing = False
         self._since, self._before = 0.0, {}
 
     @property
@@ -49,7 +50,7 @@ class Interrupt:
         if self.number is None:
             self.number, self._since = number, time.monotonic()
             _say(SAVING)
-        elif time.monotonic() - self._since > IMPATIENT:
+        elif time.monotonic() - self._since > IMPATIENT and not self.closing:
             self.at_once = True
             raise KeyboardInterrupt
 

@@ -123,8 +123,10 @@ class Trainer:
                 evaluation, zero = self._train_and_evaluate(log, interrupt)
                 finished = True
             except KeyboardInterrupt:
+                interrupt.closing = True
                 self.interrupted = interrupt.number or signal.SIGINT
             finally:
+                interrupt.closing = True
                 self._evaluators.close()
                 evaluation = evaluation or self._last_evaluation
                 result = self._write_result(evaluation, zero, finished)
