@@ -17,6 +17,7 @@ from damage import Loader
 from tensordict import TensorDict
 
 from dora.affordance.candidates import GraspCandidates
+from dora.affordance.hand import link_meshes
 from dora.affordance.maps.affordance_map import AffordanceMap
 from dora.affordance.objects import catalogue, decomposition
 from dora.affordance.objects.articulation import ARTICULATION_FILE, load_mount
@@ -36,7 +37,9 @@ from dora.agents.reports.run_results import find_runs
 from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.run_folder import RunFolder
 from dora.live.recordings import Recording
-from dora.robot import loading
+from dora.policies.card import Card
+from dora.policies.policy import bundled_files
+from dora.robot import loading, mirror
 from dora.robot.build import write_urdf
 
 ROOT = Path(__file__).parents[1]
@@ -160,6 +163,29 @@ def load_report(folder: Path) -> object:
     return write_report(folder, folder / "out")
 
 
+def mark_unfinished(folder: Path) -> None:
+    """What a run does that goes on."""
+    RunFolder(folder).mark_unfinished()
+
+
+def write_card(folder: Path) -> None:
+    shutil.copy(bundled_files("DoraCube-v1")[1], folder / "card.json")
+
+
+def load_card(folder: Path) -> object:
+    return str(Card.read(folder / "card.json"))
+
+
+def write_robot_mesh(folder: Path) -> None:
+    write_mesh("glb", folder)
+
+
+def load_robot_mesh(folder: Path) -> object:
+    mirror._mesh_image(folder / "thing.glb")
+    link_meshes._coloured.cache_clear()
+    return link_meshes._coloured(folder / "thing.glb")
+
+
 def write_robot(folder: Path) -> None:
     for name in ("robot.toml", "robot.urdf"):
         shutil.copy(ROBOT / name, folder)
@@ -266,6 +292,9 @@ LOADERS: dict[str, Loader] = {
     "config.yaml": Loader(write_config, load_config),
     "config.yaml, first": Loader(write_first_config, load_config),
     "result.json": Loader(write_result, load_results, ("result.json",)),
+    "result.json, marked": Loader(write_result, mark_unfinished, ("result.json",)),
+    "card": Loader(write_card, load_card),
+    "mesh of a robot": Loader(write_robot_mesh, load_robot_mesh),
     "curve.csv": Loader(write_result, load_results, ("curve.csv",)),
     "progress.csv": Loader(write_result, load_results, ("progress.csv",)),
     "eval.csv": Loader(write_result, load_report, ("eval.csv", "zero.csv")),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from test_bounded_meshes import glb
 
 from dora.errors import InputError
 from dora.robot import RobotDescription, load_robot
@@ -146,7 +147,10 @@ def test_meshes_are_those_that_the_urdf_names(copied: Path, tmp_path: Path):
     [
         ("meshes/other.glb", None, "other.glb is missing"),
         ("meshes/palm.stl", b"solid palm", "palm.stl is no .glb file"),
-        ("meshes/palm.glb", b"spoiled", "palm.glb is no intact glTF"),
+        ("meshes/palm.glb", b"spoiled", "the header of .*palm.glb is not valid JSON"),
+        ("meshes/palm.glb", glb({"meshes": [{}], "nodes": [{"mesh": 0}]}), "palm.glb is no intact glTF"),
+        ("meshes/palm.glb", glb({"accessors": [{"count": 10**10}]}), "palm.glb declares 10000000000 numbers"),
+        ("meshes/palm.glb", glb(b'{"a":' + b"[" * 100_000), "is not valid JSON"),
     ],
 )
 def test_without_a_mesh_nothing_is_written(copied: Path, named: str, content: bytes | None, words: str):

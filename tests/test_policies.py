@@ -308,5 +308,13 @@ def test_a_card_survives_its_file_and_damage_is_refused(tmp_path: Path) -> None:
             Card.read(tmp_path / "card.json")
 
 
+@pytest.mark.parametrize(("name", "value"), [("episodes", 0), ("success_rate", 1.5), ("seed", -1)])
+def test_a_card_with_figures_that_cannot_be_is_refused(tmp_path: Path, name: str, value: float) -> None:
+    card = json.loads(bundled_files("DoraCube-v1")[1].read_text())
+    (tmp_path / "card.json").write_text(json.dumps(card | {name: value}))
+    with pytest.raises(InputError, match=f"{name} of the card .* has to be from"):
+        Card.read(tmp_path / "card.json")
+
+
 def test_the_page_has_the_table_of_the_cards() -> None:
     assert cards_table() in (ROOT / PAGE).read_text()

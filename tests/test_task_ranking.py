@@ -16,6 +16,7 @@ from dora.tasks import make_task
 from dora.tasks.cube import hand_made_candidates
 from dora.tools.task_ranking import (
     TaskRanking,
+    _as_mapping,
     _Balanced,
     rank_bundled_set,
     rank_in_task,
@@ -49,6 +50,13 @@ def test_every_reachable_candidate_is_tried_equally_often_and_no_other():
     assert pick.tries[:3].sum() == 12
     assert pick.tries[:3].max() - pick.tries[:3].min() <= 1
     assert pick.led[:3].tolist() == [1, 0, 1]
+
+
+@pytest.mark.parametrize("settings", ["seat=1", "[" * 100_000, '{"a":' * 50 + "1" + "}" * 50, "[1, 2]"])
+def test_settings_of_early_files_are_those_of_the_search_whatever_they_are(settings: str):
+    assert _as_mapping(settings) == {"search": settings}
+    assert _as_mapping('{"ranking_steps": 3}') == {"ranking_steps": 3}
+    assert _as_mapping("") == {}
 
 
 def test_a_start_without_any_candidate_is_no_try():

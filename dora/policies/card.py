@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from dora.agents.evaluation.evaluate import Evaluation
-from dora.configs import built, check_finite, plain
+from dora.configs import LARGEST, built, check_finite, check_ranges, plain
 from dora.errors import InputError
 from dora.files import write_json
 from dora.reading import read_json
@@ -14,6 +14,14 @@ from dora.tables import share_text, text_table
 
 MOST = 100_000
 """Size of a card above which it is not read [bytes]."""
+COUNTS = ("seed", "env_steps", "total_steps", "minutes", "first_seed", "overlap_limit_mm", "counted_successes")
+"""Figures that are at least 0."""
+RANGES: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(COUNTS, (0, LARGEST)),
+    **dict.fromkeys(("episodes", "training_episodes", "chosen_among"), (1, LARGEST)),
+    **dict.fromkeys(("training_success", "success_rate", "zero_success_rate"), (0, 1)),
+}  # fmt: skip
+"""Lowest and highest value of figures."""
 SECONDS_PER_MINUTE = 60.0
 """Seconds in a minute [s]."""
 HEADINGS = (
@@ -87,13 +95,14 @@ class Card:
         """A card as `write` wrote it.
 
         Raises:
-            InputError: if it is missing, too large, or has other entries.
+            InputError: if it is missing, too large, has other entries, or figures that cannot be.
         """
         content = read_json(path, "card", MOST)
         if not isinstance(content, dict):
             raise InputError(f"{path} is no card of a policy: make it again by python -m dora.policies.bundle.")
         card = built(cls, content, f"the card {path}")
         check_finite(card, f"the card {path}")
+        check_ranges(card, RANGES, lambda name: f"{name} of the card {path}")
         return card
 
     @property

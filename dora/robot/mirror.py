@@ -20,6 +20,7 @@ import numpy as np
 import tomli_w
 import trimesh
 
+from dora.containers import MOST_FACES, check_container, check_triangles
 from dora.errors import InputError, command
 from dora.files import make_folder, write_bytes
 from dora.reading import read_toml
@@ -137,16 +138,23 @@ def _mesh_image(path: Path) -> bytes:
     """The image of a mesh file as glTF.
 
     Raises:
-        InputError: there is no such file, it is not binary glTF, or it is damaged.
+        InputError: there is no such file, it is not binary glTF, it is damaged, or declares more than it can hold.
     """
     if path.suffix != ".glb" or not path.is_file():
         raise InputError(f"the mesh {path} is {'no .glb file' if path.is_file() else 'missing'}; put one there.")
+    check_container(path)
     try:
-        image = mirrored_mesh(trimesh.load_scene(path))
+        scene = trimesh.load_scene(path)
+        faces = sum(len(scene.geometry[scene.graph[node][1]].faces) for node in scene.graph.nodes_geometry)
+        image = mirrored_mesh(scene) if faces <= MOST_FACES else trimesh.Scene()
     except Exception as error:  # the reader raises whatever it meets in a damaged file
         raise InputError(
             f"the mesh {path} is no intact glTF ({type(error).__name__}: {error}); export it again."
         ) from error
+    if faces > MOST_FACES:
+        raise InputError(f"{path} has {faces} faces; reduce it to at most {MOST_FACES}.")
+    for part in image.geometry.values():
+        check_triangles(path, np.asarray(part.vertices), np.asarray(part.faces))
     return cast(bytes, image.export(file_type="glb", include_normals=True))
 
 

@@ -22,6 +22,7 @@ from dora.affordance.objects.catalogue import AffordanceObject, load_object
 from dora.affordance.reach.feasibility_table import file_name
 from dora.errors import InputError
 from dora.parallel import run_cases
+from dora.reading import parse_json
 from dora.tasks import find_task, make_task, task_ids
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.mdp.stages import ParallelStages
@@ -286,8 +287,8 @@ def _most(sets: Mapping[str, GraspCandidates]) -> int:
 def _as_mapping(settings: str) -> dict[str, Any]:
     """Settings of candidates by name; those of early files are the search's alone."""
     try:
-        made = json.loads(settings or "{}")
-    except ValueError:
+        made = parse_json(settings or "{}", "the settings of the grasps")
+    except InputError:
         made = None
     return made if isinstance(made, dict) else {"search": settings}
 

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from trimesh.visual import ColorVisuals
 
 from dora.affordance.objects.solids import shape_mesh
-from dora.containers import MOST_FACES, check_container
+from dora.containers import MOST_FACES, check_container, check_triangles
 from dora.errors import InputError
 from dora.reading import read_xml
 from dora.robot import RobotDescription
@@ -84,6 +84,7 @@ def _coloured(path: Path) -> tuple[trimesh.Trimesh, ...]:
         raise InputError(f"{path} has {faces} faces; reduce it to at most {MOST_FACES}.")
     parts = []
     for part in pieces:
+        check_triangles(path, np.asarray(part.vertices), np.asarray(part.faces))
         factor = getattr(getattr(part.visual, "material", None), "baseColorFactor", None)
         linear = np.full(4, 255) if factor is None else np.asarray(factor)
         shown = (linear[:3] / 255) ** (1 / GAMMA)

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import fcntl
 import importlib.metadata
-import json
 import os
 import platform
 import re
@@ -17,10 +16,11 @@ import yaml
 from dora.agents.config import RunConfig, config_from_dict
 from dora.agents.evaluation.evaluate import Evaluation
 from dora.agents.limits import check
+from dora.agents.runs.stored_results import MOST_RESULT
 from dora.configs import plain
 from dora.errors import InputError
 from dora.files import write_bytes, write_csv, write_json
-from dora.reading import read_yaml
+from dora.reading import read_json, read_yaml
 from dora.version import VERSION, source_commit
 
 PACKAGES = ("mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
@@ -155,8 +155,8 @@ class RunFolder:
         """Let an earlier `result.json` say that the run is not finished, because it goes on."""
         path = self.path / "result.json"
         try:
-            result = json.loads(path.read_text())
-        except (OSError, ValueError):
+            result = read_json(path, "result", MOST_RESULT)
+        except InputError:
             return
         if isinstance(result, dict) and result.get("finished"):
             self.write_result(result | {"finished": False})
