@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import os
 import re
 import sys
 from pathlib import Path
@@ -24,7 +25,7 @@ from dora.agents.runs.run_folder import RunFolder
 from dora.commands import run
 from dora.configs import plain
 from dora.digests import digest_of
-from dora.errors import InputError
+from dora.errors import RECORDS, InputError
 from dora.tasks import find_task, make_task
 from dora.tasks.cube import CubeConfig, paper_terms
 from dora.tasks.env.options import task_config
@@ -231,6 +232,7 @@ def test_a_seed_chooses_the_starts_of_an_evaluation(
     assert len({rows(tmp_path / name)[0] for name in ("same", "a", "c")}) == 3
     assert [results[name]["zero_success_rate"] is None for name in more] == [True, True, False, True]
     assert (results["a"]["seed"], results["a"]["first_seed"]) == (3, first_seed(3, 5))
+    assert os.environ[RECORDS] == str(tmp_path / "c" / "nonfinite")  # where an evaluation puts its last states
     assert results["a"]["checkpoint"] == str(tmp_path / "run" / "checkpoints" / "best.safetensors")
 
 

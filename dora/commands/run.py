@@ -14,6 +14,7 @@ import datetime
 import difflib
 import functools
 import logging
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -34,7 +35,7 @@ from dora.agents.runs.recommended import learners_of, recommended
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.agents.runs.trainer import Trainer
 from dora.configs import plain
-from dora.errors import InputError, RunFailure, command
+from dora.errors import FAILED, RECORDS, InputError, RunFailure, command
 from dora.tasks import find_task, make_task
 from dora.tasks.env.options import task_config
 from dora.tasks.mdp.guidance_parts import guidance_in_force
@@ -43,8 +44,6 @@ from dora.tools.arguments import early_value, early_values
 
 VIDEO_EPISODES = 3
 """Episodes of a film [1]."""
-FAILED = 1
-"""Exit status of a run that cannot go on but can be resumed."""
 ZERO = "zero"
 """Name of the agent that evaluates as zero correction."""
 ENTRANCES = ("--env", "--eval-only", "--checkpoint", "--resume")
@@ -222,6 +221,7 @@ def evaluate_only(args: Args) -> Path:
     agent = ZERO if path is None else config.agent
     folder = RunFolder(args.out or default_folder(config, agent, "-eval"))
     folder.check_free()
+    os.environ[RECORDS] = str(folder.nonfinite.absolute())  # processes that are started later see it, too
     progress: dict[str, Any] = {"env_steps": 0, "wall_seconds": 0.0, "episodes": 0, "curve": []}
 
     def begin() -> None:
@@ -263,12 +263,8 @@ def film(checkpoint: Path | None, config: RunConfig, path: Path, seed: int = FIN
 def main() -> int:
     """Run the command; returns the exit status."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    try:
-        with ending_at_once():
-            args = parse(sys.argv[1:])
-            folder, status = (evaluate_only(args), 0) if args.eval_only else train(args)
-    except RunFailure as error:
-        print(error, file=sys.stderr)
-        return FAILED
+    with ending_at_once():
+        args = parse(sys.argv[1:])
+        folder, status = (evaluate_only(args), 0) if args.eval_only else train(args)
     print(folder)
     return status
