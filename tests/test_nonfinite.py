@@ -42,7 +42,9 @@ def body_of(env: Any) -> Any:
 
 
 def robot_of(env: Any) -> Any:
-    return env.agent.robot._objs[BAD]
+    """The robot, or the first of two arms."""
+    agents = getattr(env.agent, "agents", [env.agent])
+    return agents[0].robot._objs[BAD]
 
 
 def joints(value: float) -> Callable[[Any, str], None]:
@@ -90,7 +92,7 @@ def spoil(env: Any, kind: str) -> Any:
     return step
 
 
-@pytest.mark.parametrize("env_id", TASKS)
+@pytest.mark.parametrize("env_id", [*TASKS, pytest.param("DoraMicrowave-v1", marks=pytest.mark.slow)])
 def test_a_bad_row_ends_and_its_reset_is_healthy(env_id: str):
     env = make(env_id)
     for _ in range(3):

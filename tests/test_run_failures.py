@@ -13,7 +13,7 @@ import tempfile
 import time
 from multiprocessing import parent_process
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import torch
@@ -26,6 +26,7 @@ from dora import parallel
 from dora.agents.checkpoint import read_checkpoint
 from dora.agents.collecting import rollouts
 from dora.agents.collecting.task_env import TaskEnv
+from dora.agents.config import HAPPOConfig
 from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.evaluation.play import load_policy
 from dora.agents.learners.finite import check_loss, check_modules
@@ -39,6 +40,7 @@ from dora.parallel import name_of_process
 
 SHORT = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=1536, eval_every=512, stagger=False)
 SHORT_SAC = dataclasses.replace(SHORT, agent="sac", learner=SMALL_SAC)
+SHORT_HAPPO = dataclasses.replace(SHORT, agent="happo", learner=HAPPOConfig(**vars(SMALL_PPO)))
 
 
 class Breaking(PointMass):
@@ -106,11 +108,18 @@ def test_a_row_that_is_not_finite_is_terminated_and_counted():
     assert finite(env._restart_rows(torch.tensor([False, False, True, False, False])).to_dict())
 
 
-@pytest.mark.parametrize("config", [SHORT, SHORT_SAC], ids=["ppo", "sac"])
+class BreakingTwo(Breaking):
+    """Two agents, each of which moves the point along one axis."""
+
+    agent_columns: ClassVar = {"x": ([0, 1, 2, 3], [0]), "y": ([0, 1, 2, 3], [1])}
+
+
+@pytest.mark.parametrize("config", [SHORT, SHORT_SAC, SHORT_HAPPO], ids=["ppo", "sac", "happo"])
 def test_a_run_that_diverges_keeps_its_last_good_checkpoint(tmp_path: Path, config: Any):
     config = dataclasses.replace(config, checkpoint_seconds=0.0, total_steps=4096)
+    task = BreakingTwo if config is SHORT_HAPPO else Breaking
     with pytest.raises(RunFailure, match=r"^Training diverged: .*\.$"):
-        run(tmp_path / "run", config, functools.partial(Breaking, what="huge", at=80))
+        run(tmp_path / "run", config, functools.partial(task, what="huge", at=80))
     folder = RunFolder(tmp_path / "run")
     assert finite(weights(tmp_path / "run"))
     assert read_checkpoint(folder.latest).progress["env_steps"] > 0
@@ -268,6 +277,28 @@ def test_a_command_ends_quietly_while_it_is_imported(number: int, moment: float)
     assert "Traceback" not in said
 
 
+def test_a_second_signal_while_the_result_is_written_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = RunFolder(tmp_path)
+    folder.create(SHORT)
+    trainer, close = Trainer(SHORT, PointMass, folder), Evaluators.close
+    update = trainer.learner.update
+
+    def interrupted(batch: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return update(batch)
+
+    def closing(self: Evaluators) -> None:
+        time.sleep(IMPATIENT + 0.1)
+        os.kill(os.getpid(), signal.SIGTERM)
+        close(self)
+
+    monkeypatch.setattr(trainer.learner, "update", interrupted)
+    monkeypatch.setattr(Evaluators, "close", closing)
+    assert not trainer.run()["finished"]
+    assert trainer.interrupted == signal.SIGTERM
+    assert json.loads((tmp_path / "result.json").read_text())["finished"] is False
+
+
 def test_what_is_half_learned_is_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A second signal comes in the middle of learning: the checkpoint before stays."""
     folder = RunFolder(tmp_path)
@@ -379,6 +410,15 @@ def test_a_finished_run_that_goes_on_is_unfinished_meanwhile(tmp_path: Path, mon
     monkeypatch.setattr(Trainer, "_write_result", lambda *_: {})  # as if killed
     run(tmp_path / "run", dataclasses.replace(SHORT, total_steps=2048), resume=True)
     assert not json.loads(result.read_text())["finished"]
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"finished": true, "a": ' + "[" * 50 + "]" * 50 + "}"])
+def test_a_result_that_is_nested_too_deep_does_not_prevent_a_run(tmp_path: Path, content: str):
+    folder = RunFolder(tmp_path)
+    folder.create(SHORT)
+    (tmp_path / "result.json").write_text(content)
+    folder.mark_unfinished()
+    assert (tmp_path / "result.json").read_text() == content
 
 
 LEAVING = """

@@ -1,0 +1,79 @@
+"""How interrupted runs are judged: invented outcomes, and the words for what is wrong with them."""
+
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dora.agents.checkpoint import Checkpoint
+from dora.agents.config import RunConfig
+from dora.agents.runs.run_folder import RunFolder
+from dora.commands import interruptions
+from dora.commands.interruptions import END, FIRST_LINE, Outcome, judged, resumed
+
+GOOD: dict[str, Any] = {"line": 0.3, "end": 2.0, "status": 143, "said": "Interrupted: saving.\n", "left": frozenset()}
+"""What SIGTERM should make of a run."""
+LEFT = frozenset({"/dev/shm/sem.mp-dora-1-2-3"})
+
+
+def judge(folder: Path, monkeypatch: pytest.MonkeyPatch, number: int = signal.SIGTERM, **change: Any) -> Outcome:
+    """The judgement of an interruption that ended as `GOOD` says, but for some changes."""
+    found = GOOD | change
+    end = found["line"], found["end"], found["status"], found["said"], 4711
+    monkeypatch.setattr(interruptions, "interrupt", lambda *_: end)
+    monkeypatch.setattr(interruptions, "left_behind", lambda process: found["left"])
+    return judged(number, 5.0, folder, group=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "problems"),
+    [
+        ({}, []),
+        ({"status": 0, "line": None}, []),  # it had finished before
+        ({"status": 130}, ["exit status 130 instead of 143"]),
+        ({"line": None}, [f"no line within {FIRST_LINE:.0f} s"]),
+        ({"line": FIRST_LINE + 0.1}, [f"no line within {FIRST_LINE:.0f} s"]),
+        ({"end": END + 0.1}, [f"not ended within {END:.0f} s"]),
+        ({"said": "Traceback (most recent call last):\n  ...\nKeyError: 3\n"}, ["traceback: KeyError: 3"]),
+        ({"left": LEFT}, [f"left {min(LEFT)}"]),
+        ({"status": 1, "line": None}, ["exit status 1 instead of 143", f"no line within {FIRST_LINE:.0f} s"]),
+    ],
+)
+def test_what_is_wrong_with_an_interrupted_run_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], problems: list[str]
+):
+    outcome = judge(tmp_path, monkeypatch, **change)
+    assert outcome.problems == problems
+    assert outcome.steps is None
+    assert str(outcome).endswith("; ".join(problems) or "good")
+
+
+def test_of_a_killed_run_neither_line_nor_status_nor_what_is_left_is_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    outcome = judge(tmp_path, monkeypatch, signal.SIGKILL, status=-9, line=None, left=LEFT)
+    assert outcome.problems == []
+    assert outcome.left == LEFT
+
+
+def test_the_steps_of_a_run_are_those_of_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = RunFolder(tmp_path)
+    folder.checkpoints.mkdir()
+    Checkpoint(RunConfig("Fake-v1", "ppo", "none"), (4, 2), {}, {"env_steps": 512}).write(folder.latest)
+    assert judge(tmp_path, monkeypatch).steps == 512
+
+
+@pytest.mark.parametrize("begun", [True, False])
+def test_a_run_that_cannot_go_on_is_a_problem_if_it_had_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begun: bool
+):
+    left = tmp_path / "left"
+    left.touch()
+    words = ["python", "-c", "raise SystemExit('Nothing fits.')"]
+    monkeypatch.setattr(interruptions, "command", lambda *_: words)
+    if begun:
+        (tmp_path / "config.yaml").touch()
+    outcome = Outcome(5.0, 0.3, 2.0, 143, None, frozenset({str(left)}))
+    resumed(outcome, tmp_path)
+    assert outcome.problems == (["cannot be resumed: Nothing fits.", f"left for good: {left}"] if begun else [])
