@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -23,6 +24,7 @@ from dora.affordance.views.server import start_server
 from dora.agents.reports.report import write_report
 from dora.agents.runs.run_folder import RunFolder
 from dora.files import read_tensors
+from dora.live.recordings import MOST_MEMBERS, Recording
 from dora.reading import read_array, read_toml, read_xml, read_yaml
 from dora.robot.urdf import read_urdf
 from dora.tables import markdown_text
@@ -257,6 +259,57 @@ def test_names_of_classes_are_text_on_the_page(monkeypatch: pytest.MonkeyPatch):
 def test_no_page_without_an_address(host: str, port: int, words: str):
     with refused(words, 10.0):
         start_server(host, port, "page")
+
+
+def unwritten(group: Any) -> None:
+    for k in range(12):
+        group.create_dataset(f"env_states/actors/{k}", shape=(1, 9_999_999), dtype="f4")
+
+
+def huge_chunks(group: Any) -> None:
+    for k in range(3):
+        group.create_dataset(f"env_states/actors/{k}", shape=(2, 13), maxshape=(None, 13), chunks=(400_000, 13))
+        group[f"env_states/actors/{k}"][:] = 0
+
+
+def repeated(group: Any) -> None:
+    group["env_states/0/x"] = np.zeros((1, 1))
+    for k in range(7):
+        group.create_group(f"env_states/{k + 1}")
+        for copy in range(10):
+            group[f"env_states/{k + 1}/{copy}"] = group[f"env_states/{k}"]
+
+
+def many(group: Any) -> None:
+    for k in range(MOST_MEMBERS + 1):
+        group[f"env_states/{k}"] = np.zeros((1, 1))
+
+
+def endless(group: Any) -> None:
+    group.create_group("env_states")
+    group["env_states/again"] = group["env_states"]
+
+
+@pytest.mark.parametrize(
+    ("fill", "words"),
+    [
+        (unwritten, "more than 10000000 numbers"),
+        (huge_chunks, "more than 10000000 numbers"),
+        (repeated, "too many"),
+        (many, "too many"),
+        (endless, "too deep"),
+    ],
+)
+def test_recordings(tmp_path: Path, fill: Callable[[Any], None], words: str):
+    index = {"env_info": {"env_id": "DoraCube-v1"}, "episodes": [{"episode_id": 0}]}
+    written(tmp_path / "a.json", json.dumps(index))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["traj_0/actions"] = np.zeros((3, 26), np.float32)
+    assert Recording.open(tmp_path / "a.h5").episode(0).actions.shape == (3, 26)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        fill(file["traj_0"])
+    with refused(words):
+        Recording.open(tmp_path / "a.h5").episode(0)
 
 
 def tensors_file(header: bytes, data: bytes = b"") -> bytes:

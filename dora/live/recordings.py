@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,9 @@ from dora.tasks import check_task_id
 MOST_BYTES = 4_000_000_000
 """Size of a trajectory file above which it is not read [bytes]."""
 MOST_NUMBERS = 10_000_000
-"""Largest number of values of one array of an episode."""
-MOST_ARRAYS, DEEPEST = 1000, 10
-"""Largest number of arrays in one group of an episode, and depth of groups in each other."""
+"""Largest number of values of one array of an episode, and of all that is unpacked for it: whole chunks of the file."""
+MOST_MEMBERS, DEEPEST = 1000, 10
+"""Largest number of arrays and groups of an episode, and depth of groups in each other."""
 MOST_SEED = 2**32 - 1
 """Largest seed."""
 KEPT = ("guidance", "guidance_parts", "hand_joints", "preset", "config", "control_mode", "robot_uids")
@@ -95,8 +96,9 @@ class Recording:
         try:
             with h5py.File(self.path) as file:
                 group = _member(file, name)
-                actions = np.asarray(_array(group, "actions"), np.float32)
-                state = _first(_member(group, "env_states"), DEEPEST) if "env_states" in group else None
+                reader = _Reader()
+                actions = reader.rows(group, "actions")
+                state = reader.first(_member(group, "env_states"), DEEPEST) if "env_states" in group else None
         except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InputError(f"{self.path} has no intact episode {name} ({reason}): record it again.") from error
@@ -132,13 +134,30 @@ def _array(group: Any, name: str) -> Any:
     return data
 
 
-def _first(group: Any, depth: int) -> dict[str, Any]:
-    """The first row of every array of a group, as (1, ...); ValueError if it is too deep or too large."""
-    if depth == 0 or not isinstance(group, h5py.Group) or len(group) > MOST_ARRAYS:
-        raise ValueError("its states are too many, or nested too deep")
-    return {
-        name: _first(_member(group, name), depth - 1)
-        if isinstance(_member(group, name), h5py.Group)
-        else np.asarray(_array(group, name)[:1], np.float32)
-        for name in map(str, group)
-    }
+class _Reader:
+    """Reads the arrays of one episode, as long as they are few and small together."""
+
+    def __init__(self) -> None:
+        self._numbers, self._members = MOST_NUMBERS, MOST_MEMBERS
+
+    def rows(self, group: Any, name: str, count: int | None = None) -> np.ndarray:
+        """The first rows of an array, or all; ValueError for a wrong one, or if that becomes too much."""
+        data = _array(group, name)
+        shape = (len(data) if count is None else min(count, len(data)), *data.shape[1:])
+        chunks = data.chunks or (1,) * data.ndim
+        self._numbers -= prod(-(-size // chunk) * chunk for size, chunk in zip(shape, chunks, strict=True))
+        if self._numbers < 0:
+            raise ValueError(f"its arrays unpack to more than {MOST_NUMBERS} numbers")
+        return np.asarray(data[: shape[0]], np.float32)
+
+    def first(self, group: Any, depth: int) -> dict[str, Any]:
+        """The first row of every array of a group, as (1, ...); ValueError if it is too deep or too large."""
+        self._members -= len(group) if isinstance(group, h5py.Group) else 0
+        if depth == 0 or not isinstance(group, h5py.Group) or self._members < 0:
+            raise ValueError("its states are too many, or nested too deep")
+        return {
+            name: self.first(_member(group, name), depth - 1)
+            if isinstance(_member(group, name), h5py.Group)
+            else self.rows(group, name, 1)
+            for name in map(str, group)
+        }
