@@ -3,6 +3,7 @@
 import json
 import os
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -280,6 +281,22 @@ def repeated(group: Any) -> None:
             group[f"env_states/{k + 1}/{copy}"] = group[f"env_states/{k}"]
 
 
+def inflated(group: Any) -> None:
+    """A chunk of 4 kB that unpacks to 500 MB."""
+    packer = zlib.compressobj(9)
+    packed = b"".join(packer.compress(bytes(10**7)) for _ in range(50)) + packer.flush()
+    data = group.create_dataset("env_states/x", shape=(1000,), chunks=(1000,), dtype="f4", compression="gzip")
+    data.id.write_direct_chunk((0,), packed)
+
+
+def crumbs(group: Any) -> None:
+    group.create_dataset("env_states/x", shape=(1, 1_000_000), dtype="f4", chunks=(1, 1))
+
+
+def other_packing(group: Any) -> None:
+    group.create_dataset("env_states/x", data=np.zeros((5, 13)), compression="lzf")
+
+
 def many(group: Any) -> None:
     for k in range(MOST_MEMBERS + 1):
         group[f"env_states/{k}"] = np.zeros((1, 1))
@@ -295,6 +312,9 @@ def endless(group: Any) -> None:
     [
         (unwritten, "more than 10000000 numbers"),
         (huge_chunks, "more than 10000000 numbers"),
+        (inflated, "unpacks to more than it holds"),
+        (crumbs, "more than 10000000 numbers"),
+        (other_packing, "another way than by gzip"),
         (repeated, "too many"),
         (many, "too many"),
         (endless, "too deep"),
@@ -304,8 +324,8 @@ def test_recordings(tmp_path: Path, fill: Callable[[Any], None], words: str):
     index = {"env_info": {"env_id": "DoraCube-v1"}, "episodes": [{"episode_id": 0}]}
     written(tmp_path / "a.json", json.dumps(index))
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["traj_0/actions"] = np.zeros((3, 26), np.float32)
-    assert Recording.open(tmp_path / "a.h5").episode(0).actions.shape == (3, 26)
+        file.create_dataset("traj_0/actions", data=np.random.default_rng(0).random((30, 7)), compression="gzip")
+    assert Recording.open(tmp_path / "a.h5").episode(0).actions.shape == (30, 7)
     with h5py.File(tmp_path / "a.h5", "a") as file:
         fill(file["traj_0"])
     with refused(words):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import prod
@@ -20,6 +21,8 @@ MOST_BYTES = 4_000_000_000
 """Size of a trajectory file above which it is not read [bytes]."""
 MOST_NUMBERS = 10_000_000
 """Largest number of values of one array of an episode, and of all that is unpacked for it: whole chunks of the file."""
+LEAST_CHUNK = 100
+"""What a chunk counts at least, because each takes its time [numbers]."""
 MOST_MEMBERS, DEEPEST = 1000, 10
 """Largest number of arrays and groups of an episode, and depth of groups in each other."""
 MOST_SEED = 2**32 - 1
@@ -99,7 +102,7 @@ class Recording:
                 reader = _Reader()
                 actions = reader.rows(group, "actions")
                 state = reader.first(_member(group, "env_states"), DEEPEST) if "env_states" in group else None
-        except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError, zlib.error) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InputError(f"{self.path} has no intact episode {name} ({reason}): record it again.") from error
         if actions.ndim != 2 or not len(actions) or not np.isfinite(actions).all():
@@ -134,6 +137,23 @@ def _array(group: Any, name: str) -> Any:
     return data
 
 
+def _check_chunks(data: Any, count: int) -> None:
+    """ValueError if the chunks with the first rows are not packed by gzip, or unpack to more than a chunk holds."""
+    steps = data.id.get_create_plist()
+    filters = [steps.get_filter(k)[0] for k in range(steps.get_nfilters())]
+    if not set(filters) <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}:
+        raise ValueError("an array is packed in another way than by gzip")
+    if h5py.h5z.FILTER_DEFLATE not in filters:
+        return
+    skipped, size = 1 << filters.index(h5py.h5z.FILTER_DEFLATE), prod(data.chunks or ()) * data.dtype.itemsize
+    offsets: list[tuple[int, ...]] = []
+    data.id.chunk_iter(lambda chunk: offsets.append(chunk.chunk_offset) if chunk.chunk_offset[0] < count else None)
+    for offset in offsets:
+        mask, packed = data.id.read_direct_chunk(offset)
+        if not mask & skipped and len(zlib.decompressobj().decompress(packed, size + 1)) > size:
+            raise ValueError("an array unpacks to more than it holds")
+
+
 class _Reader:
     """Reads the arrays of one episode, as long as they are few and small together."""
 
@@ -144,10 +164,13 @@ class _Reader:
         """The first rows of an array, or all; ValueError for a wrong one, or if that becomes too much."""
         data = _array(group, name)
         shape = (len(data) if count is None else min(count, len(data)), *data.shape[1:])
-        chunks = data.chunks or (1,) * data.ndim
-        self._numbers -= prod(-(-size // chunk) * chunk for size, chunk in zip(shape, chunks, strict=True))
+        chunks = data.chunks or tuple(max(size, 1) for size in shape)
+        count = prod(-(-size // chunk) for size, chunk in zip(shape, chunks, strict=True))
+        self._numbers -= count * max(prod(chunks), LEAST_CHUNK)
         if self._numbers < 0:
             raise ValueError(f"its arrays unpack to more than {MOST_NUMBERS} numbers")
+        if data.chunks:
+            _check_chunks(data, shape[0])
         return np.asarray(data[: shape[0]], np.float32)
 
     def first(self, group: Any, depth: int) -> dict[str, Any]:
