@@ -165,8 +165,8 @@ class _Reader:
         data = _array(group, name)
         shape = (len(data) if count is None else min(count, len(data)), *data.shape[1:])
         chunks = data.chunks or tuple(max(size, 1) for size in shape)
-        count = prod(-(-size // chunk) for size, chunk in zip(shape, chunks, strict=True))
-        self._numbers -= count * max(prod(chunks), LEAST_CHUNK)
+        pieces = prod(-(-size // chunk) for size, chunk in zip(shape, chunks, strict=True))
+        self._numbers -= pieces * max(prod(chunks), LEAST_CHUNK)
         if self._numbers < 0:
             raise ValueError(f"its arrays unpack to more than {MOST_NUMBERS} numbers")
         if data.chunks:
