@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -30,6 +31,8 @@ MOST_NUMBERS = 10_000_000
 """Largest number of elements that the accessors and primitives of a glTF file declare [1]."""
 MOST_XML = 350_000
 """Largest number of elements in an XML file of a mesh [1]."""
+BINARY = re.compile(rb"[^\n]*\nformat binary_(little|big)_endian 1\.0\r?\n")
+"""How a PLY file begins whose content is no text."""
 PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"7z\xbc\xaf": "7z", b"\x28\xb5\x2f\xfd": "zstd"}
 """Kinds of archives by their first bytes."""
 
@@ -64,14 +67,14 @@ def check_container(path: Path) -> None:
 
 
 def check_lines(path: Path) -> None:
-    """Refuses a mesh in text (OBJ, OFF, or PLY in ASCII) with more lines than a mesh of `MOST_FACES` faces has.
+    """Refuses a mesh in text (OBJ, OFF, or PLY that does not begin as a binary one) with more lines than a mesh of `MOST_FACES` faces has.
 
     Raises:
         InputError: naming the file.
     """
     content = read_bytes(path, "mesh file", MOST_BYTES)
     ending = path.suffix.lower()
-    if ending == ".ply" and b"format ascii" not in content[:1000]:
+    if ending == ".ply" and BINARY.match(content):
         return
     lines, most = content.count(b"\n") + content.count(b"\r"), MOST_LINES if ending == ".obj" else MOST_ROWS
     faces = content.count(b"\nf") + content.count(b"\rf") if ending == ".obj" else 0

@@ -61,6 +61,9 @@ def test_gltf(tmp_path: Path, header: Any, words: str):
         ("a.obj", "v 0 0 0\n" * 1_500_001, "1500001 lines"),
         ("a.off", "OFF\n3 600000 0\n" + "0 0 0\n" * 600_000, "600002 lines"),
         ("a.ply", "ply\nformat ascii 1.0\n" + "0 0 0\n" * 600_000, "600002 lines"),
+        ("a.ply", "ply\ncomment ascii\n" + "0 0 0\n" * 600_000, "600002 lines"),
+        ("a.ply", "ply\nFormat ASCII 1.0\n" + "0 0 0\n" * 600_000, "600002 lines"),
+        ("a.ply", "ply\nformat binary_little_endian 1.0 ascii\n" + "0 0 0\n" * 600_000, "600002 lines"),
     ],
 )
 def test_meshes_in_text_have_a_limit_of_lines(tmp_path: Path, name: str, content: str, words: str):
