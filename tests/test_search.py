@@ -1,10 +1,12 @@
 """The steps that make up a grasp search, one by one; what they are made with, and the overlaps that are measured."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 import trimesh
+from numba import njit
 from torch import Tensor
 
 from dora.affordance.hand.hand_model import HandModel
@@ -15,6 +17,7 @@ from dora.affordance.search.compiled import CompiledEnergy
 from dora.affordance.search.descent import Descent, Rows, Schedule
 from dora.affordance.search.energies import RAMPED, Evaluation, GraspEnergy
 from dora.affordance.search.initial_poses import InitialPoses, Spread
+from dora.affordance.search.native.compiling import inlined, native
 from dora.affordance.search.penetration import Penetration, self_penetration
 from dora.affordance.search.search import LAST_STEP, POLISH_STEP, Search, Settings, fading
 from dora.robot import load_robot
@@ -276,3 +279,12 @@ def test_the_overlap_of_the_hand_with_itself_is_that_of_the_worst_pair():
         float(hand.radius[a] + hand.radius[b] - torch.cdist(axes[a], axes[b]).min()) for a, b in hand.pairs.tolist()
     ]
     assert float(found[1]) == pytest.approx(max(overlaps), abs=2e-4)
+
+
+def test_functions_are_compiled_where_nothing_can_be_kept():
+    """Neither beside the code nor in the user's folder; here because the code is in no file."""
+    code: dict[str, Any] = {}
+    exec("def double(x): return 2 * x", code)
+    with pytest.raises(RuntimeError, match="no locator available"):
+        njit(cache=True)(code["double"])
+    assert (native(code["double"])(3), inlined(code["double"])(4)) == (6, 8)

@@ -1,7 +1,8 @@
-"""Decorators that compile functions by Numba, kept on disk."""
+"""Decorators that compile functions by Numba, kept on disk where that can be written."""
 
 import inspect
 from collections.abc import Callable
+from typing import Any
 
 from numba import njit
 
@@ -11,9 +12,17 @@ RELAXED = {"contract", "reassoc", "nsz", "arcp"}
 
 def native(function: Callable) -> Callable:
     """A function compiled by Numba and cached on disk; decorators that check types are removed first."""
-    return njit(cache=True, error_model="numpy", fastmath=RELAXED)(inspect.unwrap(function))
+    return _compiled(function)
 
 
 def inlined(function: Callable) -> Callable:
     """As `native`, for small functions in inner loops: inlined into their callers."""
-    return njit(cache=True, error_model="numpy", fastmath=RELAXED, forceinline=True)(inspect.unwrap(function))
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: Callable, **options: Any) -> Callable:
+    plain, options = inspect.unwrap(function), {"error_model": "numpy", "fastmath": RELAXED, **options}
+    try:
+        return njit(cache=True, **options)(plain)
+    except RuntimeError:  # neither the folder of the code nor that of the user can be written: each process compiles
+        return njit(**options)(plain)
