@@ -67,7 +67,8 @@ def check_container(path: Path) -> None:
 
 
 def check_lines(path: Path) -> None:
-    """Refuses a mesh in text (OBJ, OFF, or PLY that does not begin as a binary one) with more lines than a mesh of `MOST_FACES` faces has.
+    """Refuses a mesh in text (OBJ, OFF, or PLY that does not begin as a binary one) with more lines than one of
+    `MOST_FACES` faces has.
 
     Raises:
         InputError: naming the file.
