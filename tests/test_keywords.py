@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from mani_skill.agents.robots import Panda
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.types import SimConfig
 
@@ -21,6 +22,7 @@ WRONG = [
     ({"num_envs": -1}, "at least 1"),
     ({"num_envs": 2.5}, "whole number"),
     ({"num_envs": True}, "whole number"),
+    ({"num_envs": 100_001}, "from 1 to 100000"),
     ({"num_envs": "4"}, "whole number"),
     ({"sim_backend": "physx_cpu_bach"}, "did you mean 'physx_cpu_batch'"),
     ({"sim_backend": 3}, "must be a text"),
@@ -37,6 +39,9 @@ WRONG = [
     ({"render_mode": "rgb"}, "choose one of human"),
     ({"shader_dir": "ray"}, "choose one of minimal"),
     ({"enable_shadow": "yes"}, "True or False"),
+    ({"enable_shadow": np.array([1, 2])}, "True or False"),
+    ({"enable_shadow": np.zeros((9, 9))}, "True or False"),
+    ({"enable_shadow": None}, "True or False"),
     ({"enhanced_determinism": "maybe"}, "True or False"),
     ({"parallel_in_single_scene": True}, "not available"),
     ({"sensor_configs": 3}, "dictionary"),
@@ -45,6 +50,10 @@ WRONG = [
     ({"reconfiguration_freq": -1}, "must be 0"),
     ({"reconfiguration_freq": 1.5}, "whole number"),
     ({"sim_config": 3}, "dictionary"),
+    ({"sim_config": np.array([1, 2])}, "dictionary"),
+    ({"robot_uids": "pandaa"}, "robot 'pandaa'"),
+    ({"robot_uids": ("panda", 3)}, "robot_uids"),
+    ({"robot_uids": []}, "robot_uids"),
     ({"sim_config": {"sim_frq": 100}}, "did you mean 'sim_freq'"),
     ({"sim_config": {"sim_freq": 0}}, "too small"),
     ({"sim_config": {"control_freq": -20}}, "too small"),
@@ -84,10 +93,20 @@ def test_arguments_of_maniskills_tasks_on_our_back_end_are_checked_as_well(optio
     assert "\n" not in str(error.value)
 
 
+def test_a_robot_that_is_not_there_gets_the_nearest_one():
+    with pytest.raises(InputError, match="no robot 'pandaa': did you mean 'panda'"):
+        gym.make("PickCube-v1", sim_backend=dora.sim.BACKEND, robot_uids=("pandaa",))
+    options: Any = {"sim_backend": dora.sim.BACKEND, "render_backend": "none", "obs_mode": "state"}
+    for robots in (["panda"], "panda", None):
+        env: Any = gym.make("PickCube-v1", num_envs=2, robot_uids=robots, **options)
+        assert isinstance(env.unwrapped.agent, Panda)
+        env.close()
+
+
 def test_every_keyword_of_maniskill_has_a_wrong_value_here():
     import inspect
 
-    tried = {name for options, _ in WRONG for name in options} | {"robot_uids"}
+    tried = {name for options, _ in WRONG for name in options}
     assert set(inspect.signature(BaseEnv.__init__).parameters) - {"self"} <= tried
 
 
@@ -96,6 +115,7 @@ def test_values_that_are_right_in_another_form_are_taken():
         "DoraCube-v1",
         num_envs=np.int64(2),
         enable_shadow=np.bool_(False),
+        enhanced_determinism=np.array(0),
         sensor_configs=None,
         sim_config=None,
         render_backend=None,

@@ -13,6 +13,7 @@ import mani_skill.envs.utils.system.backend as backends
 import numpy as np
 import torch
 from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.observations import CameraObsTextures
 from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS
@@ -20,7 +21,7 @@ from mani_skill.utils.registration import EnvSpec
 from mani_skill.utils.structs.types import SimConfig
 
 from dora.arguments import suggestion
-from dora.errors import InputError
+from dora.errors import InputError, shown
 from dora.sim.batch.hooks import BACKEND, batched_by_default
 
 SIM_BACKENDS = ("auto", BACKEND, *backends.sim_backend_name_mapping)
@@ -64,9 +65,10 @@ def _init(original: Callable) -> Callable:
         kwargs = {**dict(zip(names, args, strict=False)), **kwargs}
         check_names(type(self), kwargs, names)
         if _is_checked(type(self), kwargs):
-            _check_sim_config(config := kwargs.get("sim_config") or {}, SimConfig, "sim_config")
+            config = {} if kwargs.get("sim_config") is None else kwargs["sim_config"]
+            _check_sim_config(config, SimConfig, "sim_config")
             self.num_envs = kwargs.get("num_envs", 1)  # as in ManiSkill, whose tasks may use it for their settings
-            if config:
+            if config != {}:
                 _check_rates(config, self._default_sim_config)
         original(self, **kwargs)
 
@@ -137,12 +139,14 @@ def checked_values(cls: type, kwargs: Mapping[str, Any]) -> dict[str, Any]:
     out |= {k: {} for k in (*SETTINGS, "sim_config") if k in out and out[k] is None}
     for name in SETTINGS:
         if not isinstance(out.get(name, {}), Mapping):
-            raise InputError(f"{name} must be a dictionary, not {out[name]!r}.")
+            raise InputError(f"{name} must be a dictionary, not {shown(out[name])}.")
     if (frequency := out.get("reconfiguration_freq")) is not None and frequency < 0:
         raise InputError(f"reconfiguration_freq is {frequency}: it must be 0 (never) or a number of resets.")
     if _is_ours(cls) and out.get("parallel_in_single_scene"):
         raise InputError("parallel_in_single_scene is not available for tasks of dora: leave it out.")
     _check_modes(cls, out)
+    if "robot_uids" in out and not _is_ours(cls):
+        out["robot_uids"] = _checked_robots(out["robot_uids"])
     return out
 
 
@@ -154,16 +158,34 @@ def _typed(name: str, value: Any, annotation: Any) -> Any:
         return None
     kinds -= {type(None)}
     if kinds == {str} and not isinstance(value, str):
-        raise InputError(f"{name} must be a text, not {value!r}.")
+        raise InputError(f"{name} must be a text, not {shown(value)}.")
     if kinds == {bool}:
-        if not isinstance(value, bool | np.bool_) and value not in (0, 1):
-            raise InputError(f"{name} must be True or False, not {value!r}.")
-        return bool(value)
+        scalar = value.item() if isinstance(value, np.generic | np.ndarray | torch.Tensor) and not value.ndim else value
+        if not isinstance(scalar, bool | int | float) or scalar not in (0, 1):
+            raise InputError(f"{name} must be True or False, not {shown(value)}.")
+        return bool(scalar)
     if kinds == {int}:
         if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
-            raise InputError(f"{name} is {value!r}: it must be a whole number.")
+            raise InputError(f"{name} is {shown(value)}: it must be a whole number.")
         return int(value)
     return value
+
+
+def _checked_robots(robots: Any) -> Any:
+    """The `robot_uids` of a task of ManiSkill: a name or class of a robot, or a tuple of those; None stays None."""
+    if robots is None:
+        return None
+    names = robots if isinstance(robots, tuple | list) else (robots,)
+    if not names:
+        raise InputError("robot_uids names no robot: leave it out for the task's own.")
+    for name in names:
+        if isinstance(name, type) and issubclass(name, BaseAgent):
+            continue
+        if not isinstance(name, str):
+            raise InputError(f"robot_uids must be the name of a robot, or a tuple of names, not {shown(robots)}.")
+        if name not in ("none", *REGISTERED_AGENTS):
+            raise InputError(f"there is no robot {name!r}: {suggestion(name, REGISTERED_AGENTS)}")
+    return tuple(robots) if isinstance(robots, list) else robots
 
 
 def _check_backends(cls: type, kwargs: Mapping[str, Any]) -> None:
@@ -216,7 +238,7 @@ def _check_sim_config(config: Any, cls: Any, where: str) -> None:
     if isinstance(config, cls):
         config = {field.name: getattr(config, field.name) for field in dataclasses.fields(cls)}
     if not isinstance(config, Mapping):
-        raise InputError(f"{where} must be a dictionary or a {cls.__name__}, not {config!r}.")
+        raise InputError(f"{where} must be a dictionary or a {cls.__name__}, not {shown(config)}.")
     hints = typing.get_type_hints(cls)
     for name, value in config.items():
         path = f"{where}[{name!r}]"
@@ -228,7 +250,7 @@ def _check_sim_config(config: Any, cls: Any, where: str) -> None:
             if _typed(path, value, int) < (1 if name.endswith("_freq") else 0):
                 raise InputError(f"{path} is {value}: it is too small.")
         elif hints[name] is float and not (isinstance(value, int | float | np.number) and math.isfinite(value)):
-            raise InputError(f"{path} must be a finite number, not {value!r}.")
+            raise InputError(f"{path} must be a finite number, not {shown(value)}.")
 
 
 def _check_rates(config: Any, default: SimConfig) -> None:

@@ -21,7 +21,7 @@ from mani_skill.utils.structs import Actor, Articulation, ArticulationJoint
 from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
 from sapien import physx
 
-from dora.errors import InputError
+from dora.errors import InputError, shown
 from dora.sim.batch import resets
 from dora.sim.batch.actions import check_action, finite_rows, plain_action
 from dora.sim.batch.guard import StateGuard, marked
@@ -30,6 +30,8 @@ from dora.sim.batch.scene import BatchScene
 
 BACKEND = "physx_cpu_batch"
 """Name of the back end as `sim_backend`."""
+MOST_ENVS = 100_000
+"""Largest number of environments of a batch [1]."""
 SUPPORTED = {"mani_skill": "3.0.1", "sapien": "3.0.3"}
 """Versions for which the wrappers are written, by package."""
 
@@ -128,8 +130,8 @@ def _init(original: Callable) -> Callable:
             kwargs["sim_backend"] = BACKEND
             _say_default()
         if kwargs.get("sim_backend") == BACKEND:
-            if not whole or num_envs < 1:
-                raise InputError(f"num_envs is {num_envs!r}: it must be a whole number of at least 1.")
+            if not whole or not 1 <= num_envs <= MOST_ENVS:
+                raise InputError(f"num_envs is {shown(num_envs)}: it must be a whole number from 1 to {MOST_ENVS}.")
             if kwargs.get("parallel_in_single_scene"):
                 raise InputError(f"parallel_in_single_scene is not available on {BACKEND}: leave it out.")
         original(self, num_envs, *args, **kwargs)

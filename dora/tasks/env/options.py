@@ -11,6 +11,7 @@ from dora.affordance.candidates import GraspCandidates
 from dora.configs import check_finite, check_not_negative, check_ranges, overridden
 from dora.errors import InputError, shown
 from dora.robot import available_robots
+from dora.sim.batch.hooks import MOST_ENVS
 from dora.sim.batch.rendering import can_render, refuse_pictures, wants_pictures
 from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot
 from dora.sim.robots import register_robot
@@ -27,8 +28,6 @@ SHARES = ("size", "mass", "hinge")
 """Half widths of the randomisation that are shares of what they change; a task may lack some."""
 MOST_DELAY = 1000
 """Largest delay of an action [control steps]."""
-MOST_ENVS = 100_000
-"""Largest number of environments of a batch [1]."""
 
 
 @dataclass(frozen=True)
