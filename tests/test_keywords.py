@@ -9,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from mani_skill.agents.robots import Panda
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.types import SimConfig
 
@@ -99,7 +98,7 @@ def test_a_robot_that_is_not_there_gets_the_nearest_one():
     options: Any = {"sim_backend": dora.sim.BACKEND, "render_backend": "none", "obs_mode": "state"}
     for robots in (["panda"], "panda", None):
         env: Any = gym.make("PickCube-v1", num_envs=2, robot_uids=robots, **options)
-        assert isinstance(env.unwrapped.agent, Panda)
+        assert type(env.unwrapped.agent).__name__.startswith("Panda")
         env.close()
 
 

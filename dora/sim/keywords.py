@@ -145,8 +145,8 @@ def checked_values(cls: type, kwargs: Mapping[str, Any]) -> dict[str, Any]:
     if _is_ours(cls) and out.get("parallel_in_single_scene"):
         raise InputError("parallel_in_single_scene is not available for tasks of dora: leave it out.")
     _check_modes(cls, out)
-    if "robot_uids" in out and not _is_ours(cls):
-        out["robot_uids"] = _checked_robots(out["robot_uids"])
+    if not _is_ours(cls) and (robots := out.pop("robot_uids", None)) is not None:  # None stands for the task's own
+        out["robot_uids"] = _checked_robots(robots)
     return out
 
 
@@ -172,9 +172,7 @@ def _typed(name: str, value: Any, annotation: Any) -> Any:
 
 
 def _checked_robots(robots: Any) -> Any:
-    """The `robot_uids` of a task of ManiSkill: a name or class of a robot, or a tuple of those; None stays None."""
-    if robots is None:
-        return None
+    """The `robot_uids` of a task of ManiSkill: a name or class of a robot, or a tuple of those."""
     names = robots if isinstance(robots, tuple | list) else (robots,)
     if not names:
         raise InputError("robot_uids names no robot: leave it out for the task's own.")
