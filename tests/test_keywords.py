@@ -39,7 +39,7 @@ WRONG = [
     ({"shader_dir": "ray"}, "choose one of minimal"),
     ({"enable_shadow": "yes"}, "True or False"),
     ({"enable_shadow": np.array([1, 2])}, "True or False"),
-    ({"enable_shadow": np.zeros((9, 9))}, "True or False"),
+    ({"enable_shadow": np.zeros((2, 2))}, "True or False"),
     ({"enable_shadow": None}, "True or False"),
     ({"enhanced_determinism": "maybe"}, "True or False"),
     ({"parallel_in_single_scene": True}, "not available"),
