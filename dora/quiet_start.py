@@ -8,6 +8,7 @@ import select
 import signal
 import sys
 from collections.abc import Callable
+from typing import TextIO
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Signals that end a command."""
@@ -54,16 +55,14 @@ def printing(main: Callable[[], int]) -> int:
             if sys.stdout is not None:  # as after >&-
                 sys.stdout.flush()
     except BrokenPipeError:
-        if _is_read():
+        if sys.stdout is None or _is_read(sys.stdout):
             raise  # another pipe has broken
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is left to print
         return UNREAD
 
 
-def _is_read() -> bool:
-    """Whether there is still a reader of the standard output."""
-    if sys.stdout is None:
-        return True
-    output = select.poll()
-    output.register(sys.stdout.fileno(), 0)
-    return not any(event & (select.POLLERR | select.POLLHUP) for _, event in output.poll(0))
+def _is_read(output: TextIO) -> bool:
+    """Whether what is written there still has a reader."""
+    state = select.poll()
+    state.register(output.fileno(), 0)
+    return not any(event & (select.POLLERR | select.POLLHUP) for _, event in state.poll(0))
