@@ -162,6 +162,8 @@ def test_searches(words: str, message: str, monkeypatch: pytest.MonkeyPatch, cap
         ("bench", "env --workers -1", "--workers is -1"),
         ("bench", f"env --workers {HUGE}", "--workers"),
         ("bench", "env --env PickCub-v1", "did you mean PickCube-v1"),
+        ("bench", "page --seconds 0", "--seconds is 0"),
+        ("bench", "page DoraCub-v1", "did you mean DoraCube-v1"),
         ("bench", "grasp --object cub", "did you mean cube"),
         ("bench", "grasp --robot nothing", "unknown robot"),
         ("bench", "physics --starts 0", "--starts is 0"),

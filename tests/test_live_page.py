@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import socket
 import subprocess
 import sys
@@ -12,19 +13,21 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 import trimesh
 from browser import find_browser, open_page, until
 from commands import call, load_command
 from live import Watched, free_port
+from pictures import drawn
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'viser>=1.1'")
 
 from dora.affordance.objects.catalogue import load_object
 from dora.errors import InputError
 from dora.live.orders import Choose, Randomise, Reset, Run, Start
-from dora.live.page import Page
+from dora.live.page import UPDATES, Page
 from dora.live.panel import NEAREST
 from dora.live.players import zero_correction
 from dora.live.scene_view import HIDDEN, LENGTH, LONGEST, ON_HAND, ON_OBJECT, SceneView, arrows
@@ -275,6 +278,33 @@ def test_the_page_ends_with_ctrl_c_which_the_command_reports(monkeypatch: pytest
     with pytest.raises(KeyboardInterrupt):
         play.serve(Session("DoraCube-v1", [zero_correction({})], preset="none"), 8080, "127.0.0.1")
     assert ended == [True]
+
+
+@drawn
+@pytest.mark.slow
+def test_a_film_of_the_policy_is_written(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    path = tmp_path / "films" / "film.mp4"
+    assert call(load_command("play"), monkeypatch, "DoraCube-v1", "--video", str(path)) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(path)
+    with imageio.get_reader(path) as reader:
+        frames: Any = [np.asarray(frame) for frame in reader]  # pyright: ignore[reportGeneralTypeIssues]
+    assert len(frames) > 20
+    assert all(frame.std() > 5 for frame in frames)
+    assert any((frame != frames[0]).any() for frame in frames)
+
+
+@pytest.mark.slow
+def test_the_rate_of_the_page_is_measured(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    bench = load_command("bench")
+    assert call(bench, monkeypatch, "page", "DoraCube-v1", "--zero-correction", "--seconds", "6", "--json") == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["seconds"] == pytest.approx(6, abs=1)
+    assert 10 < found["states_per_second_running"] < 1.2 * UPDATES
+    assert found["states_per_second"] <= found["states_per_second_running"]
+    assert 0.1 < found["real_time"] < 1.2
+    assert found["kilobytes_per_second"] > 1
 
 
 @pytest.mark.slow

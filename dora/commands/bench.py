@@ -2,17 +2,21 @@
 
 import dataclasses
 import json
+from typing import Literal
 
+import torch
 import tyro
 
 from dora.agents.learners import benchmark as learner_benchmark
 from dora.agents.runs.recommended import recommended
+from dora.commands import play
 from dora.errors import command
+from dora.live import page_rate
 from dora.parallel import available_cores
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.tables import print_table
-from dora.tasks import find_task, make_task
+from dora.tasks import check_task_id, find_task, make_task
 from dora.tools import env_benchmark as benchmark
 from dora.tools import grasp_benchmark
 from dora.tools import physics_benchmark as task_physics
@@ -99,6 +103,28 @@ def bench_physics(
     print_table(list(flat[0]), [[f"{value:.4g}" for value in row.values()] for row in flat])
 
 
+def bench_page(
+    env: tyro.conf.Positional[str] = "DoraHammer-v1",
+    seconds: float = 12.0,
+    preset: Literal["none", "standard", "hard"] = "standard",
+    zero_correction: bool = False,
+    json: bool = False,
+) -> None:
+    """States per second that the page of `dora play` sends to one client, which takes all and draws nothing.
+
+    Args:
+        env: a Dora id; who acts is the policy that comes with it, if one does.
+        seconds: length of the measurement, rests between episodes included [s].
+        preset: how much episodes are randomised.
+        zero_correction: let the zero action act.
+        json: print one JSON object on the last line instead of a table.
+    """
+    check_task_id(env)
+    torch.set_num_threads(1)  # as `dora play`
+    players = play.find_players(play.Args(env=env, zero_correction=zero_correction))
+    report(dataclasses.asdict(page_rate.measure(env, players, seconds, preset)), json)
+
+
 def report(result: dict, as_json: bool) -> None:
     """Print a result as a table or as one line of JSON."""
     if as_json:
@@ -107,7 +133,9 @@ def report(result: dict, as_json: bool) -> None:
         print_table(("what", "value"), [(name, str(value)) for name, value in result.items()])
 
 
-KINDS = {"env": bench_env, "grasp": bench_grasp, "learner": bench_learner, "physics": bench_physics}
+KINDS = {
+    "env": bench_env, "grasp": bench_grasp, "learner": bench_learner, "page": bench_page, "physics": bench_physics,
+}  # fmt: skip
 """What `dora bench NAME` does."""
 
 
