@@ -358,6 +358,23 @@ def test_an_action_that_is_not_finite_stops_time_and_is_explained():
     watched.session.stop()
 
 
+@pytest.mark.slow
+def test_two_arms_are_shown_without_candidates_and_starts_to_choose():
+    watched = Watched("DoraMicrowave-v1", preset="none", seed=3)
+    setup = watched.state.setup
+    assert (setup.candidates, setup.numbers) == ((), ())
+    assert set(watched.state.objects) == {"microwave", "cube"}
+    assert set(watched.state.goals) == set(watched.state.episode.chosen) == {"left", "right"}
+    assert {"body", "door", "handle"} <= set(watched.state.fixtures)
+    for order, words in ((Choose(0), "has 0 that can be chosen"), (Start((0.5,)), "has 0 numbers")):
+        assert words in watched.do(order).message
+    state = watched.to_the_end()
+    assert state.episode.over
+    assert state.episode.furthest > setup.stages.index("open")
+    assert state.episode.history.terms.shape == (state.episode.step, len(setup.terms))
+    watched.session.stop()
+
+
 def test_nobody_who_acts_and_unknown_names_are_refused():
     with pytest.raises(InputError, match="Somebody has to act"):
         Session("DoraCube-v1", [])
