@@ -159,7 +159,8 @@ def test_the_environment_that_a_policy_makes_fits_it() -> None:
 
 
 @pytest.mark.parametrize("env_id", ["DoraCube-v1", pytest.param("DoraHammer-v1", marks=pytest.mark.slow),
-                                    pytest.param("DoraJug-v1", marks=pytest.mark.slow)])  # fmt: skip
+                                    pytest.param("DoraJug-v1", marks=pytest.mark.slow),
+                                    pytest.param("DoraMicrowave-v1", marks=pytest.mark.slow)])  # fmt: skip
 def test_a_policy_succeeds_in_the_environment_of_gym_make(env_id: str) -> None:
     """On starts that no training, evaluation or card uses."""
     policy = dora.load_policy(env_id)
