@@ -17,6 +17,7 @@ from torchrl.envs.utils import check_env_specs
 
 from dora.errors import InputError
 from dora.integrations.batches import make_batch
+from dora.integrations.torchrl import BatchEnv
 from dora.integrations.torchrl import make as make_torchrl
 
 LIMIT, COUNT = 6, 3
@@ -45,6 +46,16 @@ def test_torchrl_collects_from_it(env_id: str):
     began = batch["observation"][:, 1:][done[:, :-1]]
     assert not torch.equal(began, batch["next", "observation"][:, :-1][done[:, :-1]])
     env.close()
+
+
+@pytest.mark.parametrize(
+    ("ignored", "ends"), [(False, [[1, 3, 5, 7], [3, 7]]), (True, [[3, 7], [3, 7]])], ids=["ends", "goes on"]
+)
+def test_a_success_ends_an_episode_of_torchrl_unless_that_is_ignored(ignored: bool, ends: list[list[int]]):
+    rollout = BatchEnv(Succeeding(), ignored).rollout(8, break_when_any_done=False)["next"]
+    assert [torch.nonzero(row[:, 0])[:, 0].tolist() for row in rollout["done"]] == ends
+    assert rollout["success"][0, ends[0][0]]
+    assert bool(rollout["terminated"].any()) != ignored
 
 
 def test_torchrl_sees_what_gymnasium_sees():
@@ -190,6 +201,7 @@ class Succeeding(gym.Env):
     """Two environments, the first of which succeeds in its second step; time is over after four."""
 
     num_envs = 2
+    device = torch.device("cpu")
     single_observation_space = gym.spaces.Box(-1, 1, (1,))
     single_action_space = gym.spaces.Box(-1, 1, (1,))
 

@@ -21,18 +21,20 @@ ENDS = ("terminated", "truncated")
 """Names of the two ways in which an episode ends."""
 
 
-def make(env_id: str, num_envs: int = 16, **options: Any) -> "BatchEnv":
+def make(env_id: str, num_envs: int = 16, ignore_terminations: bool = False, **options: Any) -> "BatchEnv":
     """A batch as a TorchRL environment of `batch_size` (num_envs,).
 
     Args:
         env_id: id of Dora or ManiSkill.
         num_envs: environments in the batch.
+        ignore_terminations: let an episode last until its time is over. Otherwise a success ends it, and as nothing is
+            counted after that, a learner with a dense reward would rather not succeed.
         options: further arguments of `gym.make`, such as `guidance="none"` or `max_episode_steps=50`.
 
     Raises:
         InputError: if observations or actions are no array.
     """
-    return BatchEnv(make_batch(env_id, num_envs, options))
+    return BatchEnv(make_batch(env_id, num_envs, options), ignore_terminations)
 
 
 class BatchEnv(EnvBase):
@@ -43,12 +45,13 @@ class BatchEnv(EnvBase):
 
     Args:
         env: a batched environment with arrays as observations and actions, see `make_batch`.
+        ignore_terminations: episodes end when their time is over, and not by success or failure.
     """
 
-    def __init__(self, env: gym.Env):
+    def __init__(self, env: gym.Env, ignore_terminations: bool = False):
         base: Any = env.unwrapped
         super().__init__(device=base.device, batch_size=torch.Size([base.num_envs]))
-        self.env, self._seed = env, None
+        self.env, self._seed, self._ignore = env, None, ignore_terminations
         actions, observations = (env.get_wrapper_attr(f"single_{what}_space") for what in ("action", "observation"))
         n, device = base.num_envs, base.device
         low, high = (torch.as_tensor(x, device=device).expand(n, -1) for x in (actions.low, actions.high))
@@ -81,6 +84,7 @@ class BatchEnv(EnvBase):
         n = self.batch_size[0]
         reward, terminated, truncated = (torch.as_tensor(x, device=self.device).reshape(n, 1) for x in values)
         success = info.get("success", torch.zeros_like(terminated)).reshape(n, 1)
+        terminated = terminated & (not self._ignore)
         ends = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated}
         return self._of({"observation": observation, "reward": reward, "success": success, **ends})
 
