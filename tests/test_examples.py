@@ -1,8 +1,9 @@
-"""Every file in `examples/` runs; ManiSkill's `demo_robot` shows the robot."""
+"""Every file in `examples/` runs; ManiSkill's `demo_robot` shows the robot, and `demo_random_action` moves it."""
 
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -12,8 +13,11 @@ from dora.sim import can_render
 DEMO = Path(__file__).parent.parent / "examples" / "demo_robot.py"
 EXAMPLES = {
     "demo_robot": (["--help"], "--keyframe-actions"),  # it wants a screen: more of it is tried above
+    "gymnasium_films": (["--films", "films"], "in a batch: observations (8, 211)"),
+    "maniskill_tools": (["--out", "recorded"], "Replayed 1 episodes, 1/1=100.00% demos saved"),
     "own_energy": ([], "with weight 200 the energy is 0."),
     "pettingzoo_arms": (["--episodes", "1"], "agents: left, right; state of"),
+    "read_dataset": (["--out", "cube"], "2 episodes, 110 frames at 20 Hz"),
     "skrl_ppo": (["--steps", "256", "--num-envs", "4", "--episodes", "4"], "after 256 steps: return"),
     "stable_baselines": (["--steps", "256", "--num-envs", "4", "--episodes", "4"], "of 4 episodes"),
     "third_party_task": ([], "4 of 4 palms came to their cubes"),
@@ -22,10 +26,11 @@ EXAMPLES = {
 """Arguments of every example, and something that it prints."""
 
 
-def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+def run(*arguments: str, cwd: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
     """What a new Python process prints."""
+    environment = os.environ | environment
     return subprocess.run(
-        [sys.executable, *arguments], capture_output=True, text=True, timeout=300, env=os.environ | environment
+        [sys.executable, *arguments], capture_output=True, text=True, timeout=300, cwd=cwd, env=environment
     )
 
 
@@ -86,11 +91,34 @@ def test_every_example_is_run():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_an_example_runs(name):
+def test_an_example_runs(name, tmp_path):
+    """In a folder of its own, as files may be written there."""
     arguments, printed = EXAMPLES[name]
-    result = run(str(DEMO.parent / f"{name}.py"), *arguments)
+    result = run(str(DEMO.parent / f"{name}.py"), *arguments, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert printed in result.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not can_render(), reason="needs a Vulkan driver: docs/rendering.md")
+@pytest.mark.skipif(find_spec("moviepy") is None, reason="RecordVideo needs moviepy: pip install 'gymnasium[other]'")
+def test_gymnasium_films_where_there_is_a_driver(tmp_path):
+    result = run(str(DEMO.parent / "gymnasium_films.py"), "--films", "films", cwd=tmp_path)
+    assert "a film is in films" in result.stdout, result.stderr
+    (film,) = (tmp_path / "films").glob("*.mp4")
+    assert film.stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_maniskills_demo_of_random_actions_runs_a_batch(tmp_path):
+    words = ("-m", "mani_skill.examples.demo_random_action", "-e", "dora:DoraCube-v1", "-n", "2", "-s", "0")
+    result = run(*words, "--render-mode", "none", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "Control mode wrist_delta_hand_pos" in result.stdout
+    assert "truncated tensor([True, True])" in result.stdout
+    quiet = run(*words, "--quiet", cwd=tmp_path)  # with the render mode of its own, for which there may be no driver
+    assert quiet.returncode == 0, quiet.stderr
+    assert "reward" not in quiet.stdout
 
 
 def test_without_a_driver_the_demo_says_so():
