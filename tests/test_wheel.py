@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import sysconfig
 import tomllib
 import zipfile
 from email.parser import Parser
@@ -17,6 +18,7 @@ from dora.policies.policy import BUNDLED
 from dora.version import source_commit
 
 ROOT = Path(__file__).parents[1]
+INSTALL = ROOT / "docs" / "install.md"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
@@ -92,6 +94,29 @@ def test_the_command_works_from_the_wheel_in_an_empty_folder(installed: Path, tm
     assert "--zero-correction" in shown.stdout
 
 
+@pytest.mark.slow
+def test_the_wheel_works_in_a_virtual_environment(wheel: Path, tmp_path: Path) -> None:
+    """As pip installs it, with its command, from an empty folder; what it depends on is that of this Python."""
+    place, empty = tmp_path / "venv", tmp_path / "empty"
+    empty.mkdir()
+    python, alone = place / "bin" / "python", {"PYTHONPATH": ""}
+    made = run(sys.executable, "-m", "venv", "--system-site-packages", place, cwd=empty, **alone)
+    assert made.returncode == 0, made.stderr
+    words = ("-m", "pip", "install", "-q", "--no-deps", "--ignore-installed", wheel)
+    done = run(python, *words, cwd=empty, **alone)
+    assert done.returncode == 0, done.stderr
+    (site,) = place.glob("lib/python*/site-packages")
+    if sys.prefix != sys.base_prefix:  # packages of another virtual environment are not the system's
+        (site / "dependencies.pth").write_text(f"{sysconfig.get_path('purelib')}\n")
+    version = run(place / "bin" / "dora", "--version", cwd=empty, **alone)
+    assert version.stdout == f"dora {dora.__version__} (commit {source_commit()})\n"
+    code = f"{five_lines()}\nprint(dora.__file__)\nprint('success', bool(info['success']))"
+    played = run(python, "-c", code, cwd=empty, **alone)
+    assert played.returncode == 0, played.stderr
+    assert played.stdout.splitlines()[-2:] == [str(site / "dora" / "__init__.py"), "success True"]
+    assert not any(empty.iterdir())
+
+
 def test_the_citation_names_this_version() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert str(citation["version"]) == dora.__version__
@@ -105,3 +130,12 @@ def test_python_versions_are_said_once_and_alike() -> None:
     low, high = re.findall(r"3\.(\d+)", PROJECT["requires-python"])
     assert names == [f"3.{minor}" for minor in range(int(low), int(high))]
     assert f"Python {', '.join(names[:-1])} or {names[-1]} on Linux" in (ROOT / "README.md").read_text()
+    assert f"Linux, Python {', '.join(names[:-1])} or {names[-1]}." in INSTALL.read_text()
+
+
+def test_the_page_about_installing_names_every_extra() -> None:
+    table = INSTALL.read_text().partition("## Extras")[2].partition("\n## ")[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    assert sorted(name for row in rows for name in re.findall(r"`(\w+)`", row)) == sorted(
+        PROJECT["optional-dependencies"]
+    )
