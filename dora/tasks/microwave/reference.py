@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dora.geometry.poses import Pose, compose, inverse, relative
+from dora.geometry.poses import Pose, compose, relative
 from dora.geometry.rotations import (
     quaternion_apply,
     quaternion_from_rotation_vector,
     quaternion_multiply,
 )
 from dora.tasks.guidance.waypoints import Kept, Waypoint
-from dora.tasks.microwave.snapshot import MicrowaveSnapshot
+from dora.tasks.microwave.snapshot import MicrowaveSnapshot, relative_turn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +83,16 @@ class PlaceSettings:
     """Distance of the cube from where it was grasped in the hand at which it has been lost [m]."""
 
 
+def before(s: MicrowaveSnapshot, _: Kept, back: float) -> Pose:
+    """The candidate's wrist pose, drawn back against its approach [m]."""
+    return s.goal.p - back * s.goal.approach, s.goal.q
+
+
+def grasped(s: MicrowaveSnapshot, kept: Kept) -> Pose:
+    """The candidate's wrist pose when the hand began to close."""
+    return kept.goal
+
+
 def opening(c: OpenSettings, hinge: Float[Tensor, " 3"]) -> list[Waypoint]:
     """The way of the arm that opens the door.
 
@@ -90,12 +100,6 @@ def opening(c: OpenSettings, hinge: Float[Tensor, " 3"]) -> list[Waypoint]:
         c: its numbers.
         hinge: a point of the hinge's axis in the microwave's frame [m].
     """
-
-    def before(s: MicrowaveSnapshot, _: Kept, back: float) -> Pose:
-        return s.goal.p - back * s.goal.approach, s.goal.q
-
-    def grasped(s: MicrowaveSnapshot, kept: Kept) -> Pose:
-        return kept.goal
 
     def led(s: MicrowaveSnapshot, _: Kept) -> Pose:
         return with_door(s, hinge, (c.target - s.door).clamp(-c.lead, c.lead))
@@ -130,12 +134,6 @@ def placing(c: PlaceSettings, floor: float) -> list[Waypoint]:
         c: its numbers.
         floor: height of the cavity's floor in the microwave's frame [m].
     """
-
-    def before(s: MicrowaveSnapshot, _: Kept, back: float) -> Pose:
-        return s.goal.p - back * s.goal.approach, s.goal.q
-
-    def grasped(s: MicrowaveSnapshot, kept: Kept) -> Pose:
-        return kept.goal
 
     def carried_to(s: MicrowaveSnapshot, kept: Kept, x: float, height: float) -> Pose:
         turn = entry_turn(s, kept)
@@ -206,8 +204,3 @@ def entry_turn(s: MicrowaveSnapshot, kept: Kept) -> Float[Tensor, "n 4"]:
     turn = torch.zeros_like(s.oven_p)
     turn[:, 2] = torch.remainder(yaw + torch.pi, 2 * torch.pi) - torch.pi
     return quaternion_from_rotation_vector(turn)
-
-
-def relative_turn(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-    """Rotation in the world that takes orientation a to b."""
-    return quaternion_multiply(b, inverse((torch.zeros_like(a[:, :3]), a))[1])

@@ -23,7 +23,8 @@ from dora.tasks.mdp.snapshot import Snapshot, derived
 LEFT, RIGHT = "left", "right"
 """Names of the arms: the left one opens the door, the right one puts the cube inside."""
 CAVITY = ((0.02, 0.32), (-0.18, 0.18), (0.02, 0.28))
-"""The space inside, from the front edge of its floor to the back wall, in the microwave's frame [m]."""
+"""The space between walls, floor and top in the microwave's frame [m]; along x from 20 mm behind the front plane, which
+keeps the corners of a turned cube behind it, to the back wall."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +32,10 @@ class MicrowaveSnapshot(Snapshot):
     """A snapshot with the microwave.
 
     Attributes:
-        oven_p, oven_q: pose of its frame in the world [m], wxyz; as observed, with an error that stays the same in the
-            whole episode.
-        door: angle of the door [rad], 0 when it is shut; as observed, from the observed pose of the handle.
-        door_speed: [rad/s].
+        oven_p, oven_q: pose of its frame in the world [m], wxyz; where it is observed, with an error that stays the
+            same in the whole episode.
+        door: angle of the door [rad], 0 when it is shut; where it is observed, that of the observed pose of the handle.
+        door_speed: [rad/s], without error.
         wrists: positions of all wrists [m], world frame, in the order of the arms.
         tips_of_placer: positions of the right hand's fingertips [m], world frame.
         cube_p: centre of the cube [m], world frame.
@@ -55,22 +56,23 @@ class MicrowaveSnapshot(Snapshot):
     shut_q: Float[Tensor, " 4"]
 
     def reobserved(self, located: Callable[[Pose], Pose]) -> "MicrowaveSnapshot":
-        """The same with the observed pose of the microwave, and door and cube as those of handle and cube tell."""
+        """The same with the observed pose of the microwave, the angle of the door that follows from it and from the
+        observed pose of the handle, and the observed position of the cube."""
         oven_p, oven_q = located((self.oven_p, self.oven_q))
         shut = quaternion_multiply(oven_q, self.shut_q.expand_as(oven_q))
-        turned = quaternion_multiply(quaternion_inverse(oven_q), _turn(shut, self.objects["microwave"].q))
+        turned = quaternion_multiply(quaternion_inverse(oven_q), relative_turn(shut, self.objects["microwave"].q))
         turned = quaternion_multiply(turned, oven_q)
         angle = -rotation_vector_from_quaternion(turned)[:, 2]  # the door opens against +z
         return replace(self, oven_p=oven_p, oven_q=oven_q, door=angle, cube_p=self.objects["cube"].p)
 
 
-def _turn(a: Tensor, b: Tensor) -> Tensor:
-    """Rotation in the world that takes orientation a to b."""
+def relative_turn(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+    """Rotation in the world that takes orientation a to b, wxyz."""
     return quaternion_multiply(b, quaternion_inverse(a))
 
 
 def in_oven(s: MicrowaveSnapshot, point: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """World point -> microwave's frame [m]."""
+    """Points of the world frame in the microwave's frame [m]."""
     return quaternion_apply(quaternion_inverse(s.oven_q), point - s.oven_p)
 
 
@@ -82,7 +84,8 @@ def cube_in_oven(s: MicrowaveSnapshot) -> Float[Tensor, "n 3"]:
 
 @derived
 def inside(s: MicrowaveSnapshot) -> Bool[Tensor, " n"]:
-    """The centre of the cube, as the right arm sees it, is so far inside that the cube's front edge is, too."""
+    """The centre of the cube is in the cavity, and at least half an edge from its front end. Asks for the right arm's
+    view: the size is that of its object."""
     margin = s.object.half.amax(-1)
     p = cube_in_oven(s)
     (x0, x1), (y0, y1), (z0, z1) = CAVITY
@@ -92,7 +95,7 @@ def inside(s: MicrowaveSnapshot) -> Bool[Tensor, " n"]:
 
 @derived
 def hand_out(s: MicrowaveSnapshot) -> Bool[Tensor, " n"]:
-    """No part of the right hand that is looked at (wrist, fingertips) is behind the front plane."""
+    """The wrist and all fingertips of the right hand are in front of the front plane; other links are not tested."""
     points = torch.cat([s.tips_of_placer, s.wrists[:, -1:]], 1)
     q = quaternion_inverse(s.oven_q)[:, None].expand(-1, points.shape[1], -1)
     return quaternion_apply(q, points - s.oven_p[:, None])[..., 0].amax(-1) < 0.0
