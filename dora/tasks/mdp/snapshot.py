@@ -116,7 +116,8 @@ class Snapshot:
         hands, goals: by the name of the arm.
         objects: by their names.
         handles: name of the object that each arm handles.
-        penetration: largest overlap of hand and object, or of either with the world, now [m].
+        penetration: largest overlap of robots and objects with each other, with themselves and with the world, in any
+            physics step of the last control step [m].
         max_penetration: the same, maximum over the episode [m].
         stage: index of the active stage; the number of stages when all are done. Where arms have stages of their own,
             the number of those that are done, of all arms.
