@@ -164,6 +164,10 @@ def test_bad_tables_are_refused():
         Terms({})
     with pytest.raises(ValueError, match="penalty"):
         Terms({"a": Term(value, 1.0, "penalty")})
+    with pytest.raises(ValueError, match="task"):
+        Terms({"a": Term(value, -1.0)})
+    without = Terms({"a": Term(value, 0.0, "penalty"), "b": Term(value, 2.0)})
+    assert (without.lower, without.upper) == (0.0, 2.0)
 
 
 def test_an_episode_is_judged_with_and_without_overlap_and_at_its_end():

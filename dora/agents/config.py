@@ -128,7 +128,7 @@ class SACConfig:
     """Widths of the hidden layers of actor and critics."""
 
 
-NEUTRAL = {"arm_effort": 1.0, "pose_filter": 1.0}
+NEUTRAL = {"arm_effort": 1.0, "pose_filter": 1.0, "placed_after_overlap": 0.0}
 """Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
 CONSTANT_PULL = {"prior_last": None, "prior_steps": 100_000}
 """Settings of a pull that does not change."""

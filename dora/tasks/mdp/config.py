@@ -41,7 +41,7 @@ class TaskConfig:
     penetration_limit: float = 0.005
     """Largest overlap in an episode that counts as a success [m]."""
     arm_effort: float = 1.0
-    """Share of their torque limits with which the drives of an arm work [1]."""
+    """Share of their torque limits with which the drives of an arm work; control modes of joints ignore it [1]."""
     pose_filter: float = 1.0
     """Share of the newest measurement in the estimated pose of an object, for policy and reference; 1: no filter."""
     residual: ResidualBounds = field(default_factory=ResidualBounds)

@@ -19,7 +19,7 @@ S = TypeVar("S")
 """A task's snapshot type: a frozen dataclass of tensors whose first axis is the environment."""
 
 Part = Literal["affordance", "task", "penalty"]
-"""Parts of the schema; the weight of a penalty is negative."""
+"""Parts of the schema; the weight of a penalty is negative, or 0 where a run does without it."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Term(Generic[S]):
 
     Attributes:
         value: snapshot -> dimensionless (n,) tensor in [0, 1].
-        weight: share in the reward; negative for a penalty.
+        weight: share in the reward; not positive for a penalty, not negative for others.
         part: which part of the paper's schema the term belongs to.
         guided: True if the term exists only with guidance.
         region: True if it exists only with `guidance="affordance"`, because it knows the object's regions.
@@ -54,7 +54,7 @@ class Terms(Generic[S]):
         if not terms:
             raise ValueError("a reward needs at least one term")
         for name, term in terms.items():
-            if (term.part == "penalty") != (term.weight < 0):
+            if term.weight > 0 if term.part == "penalty" else term.weight < 0:
                 raise ValueError(f"term {name!r} of part {term.part!r} cannot have the weight {term.weight}")
         self.terms = dict(terms)
         self.lower = sum(min(t.weight, 0.0) for t in self.terms.values())

@@ -80,7 +80,7 @@ class MicrowaveWeights(PenaltyWeights):
     put: float = 1.0
     """Depth of the cube in the cavity [1]."""
     placed: float = 1.5
-    """The cube lies inside, the hand has left, the door is open, and no overlap was above the limit [1]."""
+    """The cube lies inside, the hand has left, and the door is open; less after an overlap above the limit [1]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +100,7 @@ class MicrowaveConfig(TaskConfig):
     solver_iterations: int = 16
     """PhysX position iterations; with 6 a hand that is pushed into the door goes 15 mm deep [1]."""
     arm_effort: float = 0.3
-    """Share of their torque limits with which the drives of an arm work [1]."""
+    """Share of their torque limits with which the drives of an arm work; control modes of joints ignore it [1]."""
     randomisation: MicrowaveRandomisation = field(default_factory=MicrowaveRandomisation)
     """How much episodes are randomised and perturbed; the preset's numbers, unless they are overridden."""
     centre: tuple[float, float] = (0.45, -0.43)
@@ -130,6 +130,9 @@ class MicrowaveConfig(TaskConfig):
     """Overlap that costs no reward [m]."""
     after_overlap: float = 0.3
     """Share of what carrying and putting in earns that is left once an overlap was above the limit [1]."""
+    placed_after_overlap: float = 0.0
+    """Share of what the cube that lies inside earns that is left then [1]; with this and `after_overlap` 1 and
+    `weights.penetration` 0 the reward does not depend on overlap."""
     fewest: float = 0.5
     """Smallest share of its executions that a ranked candidate must have survived to be used, as a share of the best
     candidate's [1]."""
@@ -216,14 +219,11 @@ def terms(c: MicrowaveConfig) -> Terms[MicrowaveSnapshot]:
     """The reward."""
     w = c.weights
 
-    def reach(s: MicrowaveSnapshot) -> Tensor:
-        return tolerance(to_region(s), margin=0.25)
-
     def door(s: MicrowaveSnapshot) -> Tensor:
         return (s.door / c.open).clamp(0, 1) * (s.stage >= MOVE)
 
-    def clean(s: MicrowaveSnapshot) -> Tensor:
-        return torch.where(s.max_penetration <= c.penetration_limit, 1.0, c.after_overlap)
+    def clean(s: MicrowaveSnapshot, left: float = c.after_overlap) -> Tensor:
+        return torch.where(s.max_penetration <= c.penetration_limit, 1.0, left)
 
     def carry(s: MicrowaveSnapshot) -> Tensor:
         return (0.3 * rise(s, c.lift) + 0.7 * _before(s, c)) * (0.3 + 0.7 * opposed(s).float())
@@ -235,8 +235,36 @@ def terms(c: MicrowaveConfig) -> Terms[MicrowaveSnapshot]:
         return torch.where(inside(s), 1.0, 0.8 * _depth(s, c)) * (s.stage >= PUT) * clean(s)
 
     def placed(s: MicrowaveSnapshot) -> Tensor:
-        good = (s.max_penetration <= c.penetration_limit) & (s.door >= c.open)
-        return (at_rest(s.of(RIGHT), c) & good).float()
+        return (at_rest(s.of(RIGHT), c) & (s.door >= c.open)).float() * clean(s, c.placed_after_overlap)
+
+    return Terms(
+        {
+            **_grasp_terms(c),
+            "open": Term(seen_by(LEFT, door), w.open, doc="angle of the door, once the handle was grasped"),
+            "carry": Term(
+                seen_by(RIGHT, carried), w.carry,
+                doc="rise of the cube and closeness to the place before the cavity, held by thumb and finger; less "
+                "after an overlap above the limit",
+            ),
+            "put": Term(
+                seen_by(RIGHT, put), w.put, doc="depth of the cube in the cavity; 1 inside, less after an overlap"
+            ),
+            "placed": Term(
+                placed, w.placed,
+                doc="the cube lies inside, hand out, door open; "
+                f"{c.placed_after_overlap:g} of it after an overlap above the limit",
+            ),
+            **penalties(w, c.free_overlap, c.penetration_limit),
+        }
+    )  # fmt: skip
+
+
+def _grasp_terms(c: MicrowaveConfig) -> dict[str, Term[Any]]:
+    """The terms of reaching and grasping, of each arm."""
+    w = c.weights
+
+    def reach(s: MicrowaveSnapshot) -> Tensor:
+        return tolerance(to_region(s), margin=0.25)
 
     def moved(s: MicrowaveSnapshot) -> Tensor:
         return (s.door > c.open / 4) if LEFT in s.hands else off_table(s) | inside(s)
@@ -261,24 +289,7 @@ def terms(c: MicrowaveConfig) -> Terms[MicrowaveSnapshot]:
                 doc="contacts: thumb against a finger, and how many fingers; 1 afterwards",
             ),
         }  # fmt: skip
-    return Terms(
-        {
-            **each,
-            "open": Term(seen_by(LEFT, door), w.open, doc="angle of the door, once the handle was grasped"),
-            "carry": Term(
-                seen_by(RIGHT, carried), w.carry,
-                doc="rise of the cube and closeness to the place before the cavity, held by thumb and finger; less "
-                "after an overlap above the limit",
-            ),
-            "put": Term(
-                seen_by(RIGHT, put), w.put, doc="depth of the cube in the cavity; 1 inside, less after an overlap"
-            ),
-            "placed": Term(
-                placed, w.placed, doc="the cube lies inside, hand out, door open, no overlap above the limit so far"
-            ),
-            **penalties(w, c.free_overlap, c.penetration_limit),
-        }
-    )  # fmt: skip
+    return each
 
 
 def paper_terms(c: MicrowaveConfig) -> Terms[MicrowaveSnapshot]:
