@@ -18,7 +18,9 @@ MOST_FILES = 14
 """Modules side by side in one folder, besides tests [1]."""
 MOST_LINES = 400
 """Lines of a module [1]; about 300 are the aim."""
-SCRIPTS = ("bench", "demos", "grasps", "play", "report", "run", "view")
+LONGEST_FUNCTION = 60
+"""Lines of a function without its docstring [1]."""
+SCRIPTS = ("bench", "demos", "grasps", "play", "report", "run", "sweep", "view")
 """Commands of experiments/."""
 OURS = {"DoraEnv", "DescribedRobot", "Task"}
 """Classes that users subclass."""
@@ -54,6 +56,18 @@ def test_rooms_and_modules_are_of_a_size_that_can_be_overlooked(project_root: Pa
     assert long == {}
 
 
+def test_functions_are_of_a_length_that_can_be_overlooked(project_root: Path):
+    long = {}
+    for path in modules(project_root):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                if ast.get_docstring(node) is not None:
+                    lines -= (node.body[0].end_lineno or 0) - node.body[0].lineno + 1
+                long |= {f"{path.relative_to(project_root)} {node.name}": lines} if lines > LONGEST_FUNCTION else {}
+    assert long == {}
+
+
 def test_no_helper_is_kept_in_a_room_without_a_concept(project_root: Path):
     names = {path.stem for path in modules(project_root)} | {path.parent.name for path in modules(project_root)}
     assert not names & {"utils", "util", "common", "helpers", "misc"}
@@ -72,6 +86,10 @@ def test_classes_of_ours_inherit_at_most_twice_from_ours(project_root: Path):
     chains = {name: depth(name) for name in bases}
     assert {name: n for name, n in chains.items() if n > 3} == {}
     assert set(bases) >= OURS
+
+
+def test_all_scripts_are_named(project_root: Path):
+    assert {path.stem for path in (project_root / "experiments").glob("*.py")} == set(SCRIPTS)
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
