@@ -1,8 +1,10 @@
 """DoraMicrowave-v1: geometry, stages and references on invented states, and what the scripted solution does."""
 
+import dataclasses
 from math import pi, radians
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from invented import GOAL_SHAPES, HAND_SHAPES, OBJECT_SHAPES, SHARED_SHAPES, TIP_RADIUS, record
@@ -10,6 +12,7 @@ from torch import Tensor
 
 import dora.tasks as tasks
 from dora.affordance.candidates import hand_digest
+from dora.affordance.objects.catalogue import load_object
 from dora.geometry.poses import compose
 from dora.geometry.rotations import (
     quaternion_apply,
@@ -22,7 +25,7 @@ from dora.tasks.mdp.snapshot import GoalState, HandState, ObjectState
 from dora.tasks.microwave import mdp
 from dora.tasks.microwave.mdp import MicrowaveConfig
 from dora.tasks.microwave.reference import entry_turn, with_door
-from dora.tasks.microwave.snapshot import LEFT, RIGHT, MicrowaveSnapshot, cube_in_oven, hand_out, inside
+from dora.tasks.microwave.snapshot import CAVITY, LEFT, RIGHT, MicrowaveSnapshot, cube_in_oven, hand_out, inside
 from dora.tasks.microwave.task import MicrowaveTask, mirrored, oven_mount
 
 CONFIG = MicrowaveConfig()
@@ -32,6 +35,8 @@ OVEN = (0.7, 0.05, 0.1)
 """Where the invented microwave stands [m]."""
 YAW = 0.15
 """How it is turned [rad]."""
+STARTS = 100
+"""Episodes of the scripted solution [1]."""
 
 
 def turned(angle: float, n: int = 2) -> Tensor:
@@ -131,6 +136,21 @@ def test_the_microwave_is_observed_where_it_was_located():
     torch.testing.assert_close(seen.door, torch.full((2,), 0.1), atol=1e-5, rtol=0)
 
 
+def test_the_cavity_is_what_the_walls_leave_free():
+    """From behind the front plane, so that no corner of a turned cube stands out, to the back wall."""
+    walls = {str(k): (np.array(w.position), np.array(w.size)) for k, w in enumerate(oven_mount().links[0].shapes)}
+    (x0, x1), across, height = CAVITY
+    middle = np.array([(x0 + x1) / 2, 0.0, sum(height) / 2])
+    for axis, (low, high) in ((1, across), (2, height), (0, (None, x1))):
+        faces = [(p[axis] - h[axis], p[axis] + h[axis]) for p, h in walls.values()]
+        below = [upper for _, upper in faces if upper <= middle[axis]]
+        above = [lower for lower, _ in faces if lower >= middle[axis]]
+        assert min(above) == pytest.approx(high)
+        assert low is None or max(below) == pytest.approx(low)
+    half = float(load_object("cube").mesh.extents[0]) / 2
+    assert x0 + half >= half * 2**0.5
+
+
 def error_of_place(task: Any) -> Tensor:
     """Observed less true position of the microwave (n, 3) [m]."""
     return task.observed.oven_p - task.snapshot.oven_p
@@ -228,6 +248,23 @@ def test_an_overlap_above_the_limit_pays_no_end():
     s = {"right": out(), "cube": {"p": in_world(0.12, 0.0, 0.05)}, "door": torch.full((2,), 1.2)}
     paid = TERMS["placed"].value(invented(**s, max_penetration=torch.tensor([0.004, 0.006])))
     assert paid.tolist() == [1.0, 0.0]
+
+
+def test_without_the_overlap_term_the_reward_does_not_depend_on_overlap():
+    """`--task.weights.penetration 0 --task.after-overlap 1 --task.placed-after-overlap 1`."""
+    weights = dataclasses.replace(CONFIG.weights, penetration=0.0)
+    free = mdp.terms(dataclasses.replace(CONFIG, after_overlap=1.0, placed_after_overlap=1.0, weights=weights)).terms
+    for stage, x in ((2, -0.1), (3, -0.1), (5, 0.12)):
+        stages = {LEFT: torch.full((2,), 3), RIGHT: torch.full((2,), stage)}
+        depth = torch.tensor([0.0, 0.006])
+        s = invented(
+            right=out(), cube={"p": in_world(x, 0.0, 0.05)}, door=torch.full((2,), 1.2), stages=stages,
+            penetration=depth, max_penetration=depth,
+        )  # fmt: skip
+        for name, term in free.items():
+            paid = term.weight * term.value(s)
+            assert paid[0] == paid[1], name
+    assert free["placed"].value(s).tolist() == [1.0, 1.0]
 
 
 BETTER: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
@@ -335,12 +372,14 @@ def test_stages_of_the_arms_go_on_side_by_side(task: Any):
 
 
 @pytest.mark.slow
-def test_the_scripted_solution_mostly_succeeds_without_randomisation():
-    made = tasks.make_task("DoraMicrowave-v1", 16, preset="none")
+def test_the_scripted_solution_succeeds_in_85_of_100_starts_without_randomisation():
+    made = tasks.make_task("DoraMicrowave-v1", STARTS, preset="none")
     made.reset(seed=0)
     info: dict[str, Tensor] = {}
     for _ in range(MicrowaveTask.MAX_STEPS):
         *_, info = made.step(made.scripted_action())
-    assert info["success"].float().mean() >= 0.75
+    rates = {name: info[name].float().mean().item() for name in ("success", "raw_success")}
+    print(rates, f"95 % of overlaps below {info['penetration_max_mm'].quantile(0.95):.1f} mm")
+    assert rates["success"] >= 0.85
     assert made.task.oven.angle.max() < pi / 2
     made.close()
