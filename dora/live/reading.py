@@ -154,15 +154,15 @@ def verdict(setup: Setup, failure: str, info: dict[str, Any], over: bool) -> str
         over: the episode has ended.
     """
     flags = {name: bool(info[name][0]) for name in ("success", "raw_success", "fail", "unreachable")}
-    deepest, stage = float(info["penetration_max_mm"][0]), int(info["stage"][0])
-    overlap = f"an overlap of {deepest:.1f} mm, above the limit of {setup.limit:g} mm"
+    max_penetration, stage = float(info["penetration_max_mm"][0]), int(info["stage"][0])
+    overlap = f"an overlap of {max_penetration:.1f} mm, above the limit of {setup.limit:g} mm"
     if flags["unreachable"]:
         return "failed: no candidate can be reached from this start"
     if flags["fail"]:
         return f"failed: {failure}"
     if flags["success"]:
-        return f"success: all stages done, largest overlap {deepest:.1f} mm"
-    if deepest > setup.limit:
+        return f"success: all stages done, largest overlap {max_penetration:.1f} mm"
+    if max_penetration > setup.limit:
         return f"{'failed' if over else 'cannot succeed any more'}: {overlap}"
     if over:
         return f"failed: the time was over in the stage {setup.stages[min(stage, len(setup.stages) - 1)]!r}"

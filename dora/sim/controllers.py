@@ -74,8 +74,8 @@ class WristHandController(BaseController):
     def set_motion(self, speed: float, spin: float, feed_forward: bool) -> None:
         """How fast a full action moves the wrist, and whether the arm's drives are told their velocity.
 
-        Without it the arm lags behind its command by damping / stiffness (0.1 s here), which is gentle; with it by
-        next to nothing, which catching and striking need.
+        Without it the arm follows its command with a lag of damping / stiffness (0.1 s here), which makes contacts
+        softer; with it there is almost no lag, which catching and striking need.
 
         Args:
             speed: linear speed along one axis [m/s].
@@ -207,7 +207,7 @@ class WristHandController(BaseController):
         self.articulation.set_joint_drive_targets(self.target, self.joints, self.active_joint_indices)
 
     def hold(self) -> None:
-        """Leaves the commanded joints where they are: drives that are told velocities are told that it is zero."""
+        """Keeps the commanded joints; with feed-forward, sets the velocity targets of the arm's drives to 0."""
         if self.feed_forward:
             self._tell_velocity(torch.zeros_like(self.target[:, : self.arm_size]))
 

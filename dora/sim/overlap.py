@@ -1,4 +1,4 @@
-"""Overlap of bodies in every physics step: the deepest contact of each environment, and between what it was."""
+"""Overlap of bodies in every physics step: the largest of each environment, and the two bodies of it."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -37,7 +37,7 @@ class OverlapMonitor:
     def _watch(self, environment: int, contacts: list) -> None:
         lowest = self._lowest[environment]
         for contact in contacts:
-            for point in contact.points:  # most are not the deepest, so that nothing else is asked of them
+            for point in contact.points:  # few points lower the minimum, so the bodies are looked up for those alone
                 if point.separation < lowest:
                     one, other = contact.bodies
                     if id(one) in self._watched or id(other) in self._watched:
@@ -57,6 +57,6 @@ class OverlapMonitor:
         self._lowest = [0.0] * self._count
         return depth
 
-    def deepest_pair(self, environment: int) -> tuple[str, str] | None:
-        """Names of the two bodies of the overlap found last in an environment; None without any."""
+    def max_penetration_pair(self, environment: int) -> tuple[str, str] | None:
+        """Names of the two bodies of the largest overlap found last in an environment; None without any."""
         return self._names[environment]

@@ -99,7 +99,7 @@ def draw_overlap(runs: Sequence[Run], env: str, preset: str, path: Path) -> None
     from matplotlib import pyplot
 
     figure, axis = pyplot.subplots(figsize=(7, 4.2), layout="constrained")
-    deepest = 0.0
+    max_penetration = 0.0
     for group, members in grouped(runs).items():
         if group[:2] != (env, preset):
             continue
@@ -111,8 +111,8 @@ def draw_overlap(runs: Sequence[Run], env: str, preset: str, path: Path) -> None
                 what = "" if style == "-" else ", zero correction"
                 label = f"{shortened(group[2])}, guidance {shortened(group[3])} ({len(depth)}){what}"
                 axis.step(depth, shares, style, where="post", color=COLOURS.get(group[2:4]), label=label)
-                deepest = max(deepest, float(np.percentile(depth, 99)))
-    axis.set_xlim(0, 1.05 * max(deepest, 1.0))
+                max_penetration = max(max_penetration, float(np.percentile(depth, 99)))
+    axis.set_xlim(0, 1.05 * max(max_penetration, 1.0))
     axis.set_ylim(0, 1.01)
     axis.set_xlabel("largest overlap of an episode [mm]")
     axis.set_ylabel("share of episodes below")
