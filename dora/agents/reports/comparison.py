@@ -233,7 +233,7 @@ def _claims(cells: Mapping[Cell, list[Run]]) -> Section:
             spread(jug)),
         row("PPO is better on cube and jug, SAC on the hammer", "yes", guided, learners, 2.0 * (best == wanted) - 1),
     ]  # fmt: skip
-    for env in (*ONE_ARM, "DoraMicrowave-v1"):
+    for env in dict.fromkeys(env for env, *_ in PAPER):
         both = [cell for cell in PAPER if cell[0] == env and cell[2] == "affordance"]
         bar = max(PAPER[cell].success for cell in both)
         lowest = min(both, key=lambda cell: rates.get(cell, 0.0))
