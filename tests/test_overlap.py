@@ -1,75 +1,61 @@
 """Overlap is looked for in every physics step, between everything that an arm or an object may touch."""
 
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 import pytest
 import sapien
 import torch
-from sapien import physx
+from solids import PairWatch, Solids, depth
 
 import dora.tasks as tasks
 from dora.sim.substeps import watch_physics
 from dora.tasks.env.env import DoraEnv
+from dora.tasks.microwave.snapshot import LEFT, RIGHT
+from dora.tasks.microwave.task import MicrowaveTask
 
-coal: Any = import_module("coal")
-Z_TO_X = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-"""Turns z, the axis of Coal's capsules, into x, that of PhysX's."""
-
-
-def solid(shape: Any) -> Any:
-    """Coal's geometry of a capsule or box of PhysX."""
-    if isinstance(shape, physx.PhysxCollisionShapeCapsule):
-        return coal.Capsule(float(shape.radius), 2 * float(shape.half_length))
-    return coal.Box(*(2 * float(x) for x in shape.half_size))
-
-
-def placed(pose: sapien.Pose, shape: Any) -> Any:
-    m = (pose * shape.local_pose).to_transformation_matrix().astype(float)
-    turn = m[:3, :3] @ Z_TO_X if isinstance(shape, physx.PhysxCollisionShapeCapsule) else m[:3, :3]
-    return coal.Transform3s(turn, m[:3, 3])
+OVEN = ("handle", "door", "body")
+"""Names of the bodies of the microwave."""
+BOTH = [(arm, name) for arm in (LEFT, RIGHT) for name in (*OVEN, "cube")]
+PAIRS = [*BOTH, (LEFT, RIGHT), ("cube", "door"), ("cube", "body")]
+"""What may meet in the task of the microwave, besides the table and an arm with itself."""
+HIDDEN = {"DoraMicrowave-v1": 0.3, "DoraJug-v1": 1.6}
+"""Largest 90th percentile of an episode's true overlap less the reported one [mm]."""
 
 
-def depth_by_geometry(task: DoraEnv, row: int) -> float:
-    """Largest overlap of the hand with the object, from their shapes and poses alone [m]."""
-    target = task.target_object._bodies[row]
-    deepest = 0.0
-    for link in task.agent.robot.links:
-        body = link._bodies[row]
-        if np.linalg.norm(body.entity.pose.p - target.entity.pose.p) > 0.25:
-            continue
-        for shape in body.collision_shapes:
-            for other in target.collision_shapes:
-                found = coal.distance(
-                    solid(shape), placed(body.entity.pose, shape), solid(other), placed(target.entity.pose, other),
-                    coal.DistanceRequest(), coal.DistanceResult(),
-                )  # fmt: skip
-                deepest = max(deepest, -found)
-    return deepest
+def groups_of(task: DoraEnv) -> dict[str, list[Any]]:
+    """Links of each arm, objects, and what the microwave is made of, by name."""
+    arms = {name: list(arm.agent.robot.links) for name, arm in task.arms.items()}
+    owner: Any = task.task
+    oven = owner.oven.links if isinstance(owner, MicrowaveTask) else {}
+    return {**arms, **{name: [o] for name, o in task.objects.items()}, **{name: [oven[name]] for name in oven}}
 
 
-def reported_and_true(persistent: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Largest overlap of scripted episodes [mm], as the task reports it and from geometry."""
-    n = 12
-    config = {"persistent_contacts": persistent}
-    task = tasks.make_task("DoraCube-v1", n, config=config)
+def reported_and_true(env: str, n: int, persistent: bool | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Largest overlap of scripted episodes of objects with arms and with what they are put into [mm] (n,): as PhysX
+    reports it, and from geometry.
+
+    Args:
+        env: id.
+        n: episodes, seed 100.
+        persistent: contacts that PhysX keeps; None: as the task has it.
+    """
+    task = tasks.make_task(env, n, config={} if persistent is None else {"persistent_contacts": persistent})
     task.reset(seed=100)
-    true = np.zeros(n)
-
-    def look(row: int) -> None:
-        true[row] = max(true[row], 1000 * depth_by_geometry(task, row))
-
-    watch_physics(task.scene, look)
+    pairs = PAIRS if len(task.arms) > 1 else [(arm, name) for arm in task.arms for name in task.objects]
+    watch = PairWatch(task.scene, groups_of(task), pairs)
+    info: dict[str, Any] = {}
     for _ in range(task.max_steps):
         info = task.step(torch.zeros(n, task.action_size))[-1]
     task.close()
-    return info["penetration_max_mm"].numpy(), true
+    reported, true = (1000 * overlap.max(1) for overlap in (watch.reported, watch.true))
+    print(f"reported {np.round(reported, 2)} mm, true {np.round(true, 2)} mm")
+    assert (reported <= info["penetration_max_mm"].numpy() + 1e-3).all()
+    return reported, true
 
 
 def test_nothing_deeper_than_what_is_reported_happens():
-    reported, true = reported_and_true(persistent=False)
-    print(f"reported {np.round(reported, 2)} mm, true {np.round(true, 2)} mm")
+    reported, true = reported_and_true("DoraCube-v1", 12)
     assert (true < reported + 0.5).all()
     assert true.max() > 1.0  # the test sees something
 
@@ -77,7 +63,15 @@ def test_nothing_deeper_than_what_is_reported_happens():
 @pytest.mark.slow
 def test_persistent_contacts_let_fingers_into_the_cube():
     """Why the cube does without them: a finger that slides over an edge sinks in, and no contact is reported."""
-    assert reported_and_true(persistent=True)[1].max() > 4.0
+    assert reported_and_true("DoraCube-v1", 12, persistent=True)[1].max() > 4.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("env", "n"), [("DoraMicrowave-v1", 8), ("DoraJug-v1", 32)])
+def test_persistent_contacts_hide_no_more_than_was_measured(env: str, n: int):
+    """Jug and microwave keep them, so that some overlap is deeper than reported (docs/findings.md)."""
+    reported, true = reported_and_true(env, n)
+    assert np.quantile(true - reported, 0.9) <= HIDDEN[env]
 
 
 @pytest.fixture
@@ -109,7 +103,7 @@ def test_an_overlap_that_is_over_before_the_control_step_ends_is_seen(task: Dora
     assert steps[0] == 5
     assert info["penetration_mm"][0] == pytest.approx(8.0, abs=0.5)
     assert info["penetration_mm"][1] < 1
-    assert task.task_scene.reader.overlap.deepest_pair(0) is not None
+    assert task.task_scene.reader.overlap.max_penetration_pair(0) is not None
     again = task.step(torch.zeros(2, task.action_size))[-1]
     assert again["penetration_mm"][0] < 1
     assert again["penetration_max_mm"][0] == pytest.approx(8.0, abs=0.5)
@@ -127,7 +121,7 @@ def test_the_arm_and_the_hand_themselves_are_watched(task: DoraEnv):
     robot.set_qpos(q)
     info = task.step(None)[-1]
     assert info["penetration_mm"][0] > 1.0
-    pair = task.task_scene.reader.overlap.deepest_pair(0)
+    pair = task.task_scene.reader.overlap.max_penetration_pair(0)
     assert pair is not None
     assert all(name in {link.name for link in robot.links} for name in pair)
     assert info["penetration_mm"][1] < 1.0
@@ -144,3 +138,51 @@ def test_one_environment_reports_the_same_as_a_batch():
         task.close()
     assert depths[0] > 0
     assert depths[0] == pytest.approx(depths[1], abs=1e-4)
+
+
+@pytest.fixture
+def two_arms() -> Any:
+    made = tasks.make_task("DoraMicrowave-v1", 2, preset="none")
+    made.reset(seed=0)
+    yield made
+    made.close()
+
+
+IN_OVEN = {"body": ((0.17, 0.15, 0.12), 1), "door": ((-0.06, 0.0, 0.12), 0)}
+"""Where the cube is near wall or door in the microwave's frame [m], and the axis along which it is moved into it."""
+
+
+@pytest.mark.parametrize("pair", [(LEFT, RIGHT), (RIGHT, "door"), ("cube", "body"), ("cube", "door")])
+def test_every_pair_of_the_microwave_is_watched(two_arms: DoraEnv, pair: tuple[str, str]):
+    """The first body is moved on in steps of 1 mm until shapes and poses say that it is 4 mm in the second one."""
+    groups = groups_of(two_arms)
+    one, other = (Solids(groups[name], 0) for name in pair)
+    if pair[0] == "cube":
+        place, axis = IN_OVEN[pair[1]]
+        body, start = two_arms.objects["cube"]._bodies[0].entity, groups["body"][0]._bodies[0].entity.pose
+        start, move = start * sapien.Pose(list(place)), body.set_pose
+        ahead = np.eye(3)[axis]
+    else:
+        robot = two_arms.arms[pair[0]].agent.robot._objs[0]
+        start, move = robot.root_pose, robot.set_root_pose
+        ahead = np.array([0.0, -1.0, 0.0])
+        if pair[1] == "door":
+            start, ahead = (
+                sapien.Pose((start.p + np.array([0.0, 0.25, 0.0])).tolist(), start.q),
+                np.array([1.0, 0.0, 0.0]),
+            )
+    wanted = 0.0
+    for step in range(1000):
+        move(sapien.Pose((start.p + 0.001 * step * ahead).tolist(), start.q))
+        wanted = 1000 * depth(one, other, one.poses(), other.poses())
+        if wanted >= 4:
+            break
+    assert 4 <= wanted < 8
+    info = two_arms.step(torch.zeros(2, two_arms.action_size))[-1]
+    assert info["penetration_mm"][0] >= wanted - 0.5
+    assert info["penetration_mm"][1] < 1
+    assert two_arms.snapshot.penetration[0] == pytest.approx(info["penetration_mm"][0].item() / 1000)
+    found = two_arms.task_scene.reader.overlap.max_penetration_pair(0)
+    names = [{link._bodies[0].entity.name for link in groups[name]} for name in pair]
+    assert found is not None
+    assert any(found[k] in names[0] and found[1 - k] in names[1] for k in (0, 1)), found
