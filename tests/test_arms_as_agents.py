@@ -140,6 +140,23 @@ print(json.dumps({
 
 
 @needs_pettingzoo
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_microwave_passes_the_interface_test_of_pettingzoo():
+    """Two whole episodes and the beginning of a third."""
+    found = in_process("""
+from pettingzoo.test import parallel_api_test
+from dora.integrations.pettingzoo import make
+
+env = make("DoraMicrowave-v1", max_episode_steps=8)
+parallel_api_test(env, num_cycles=20)
+print(json.dumps({name: [env.observation_space(name).shape[0], env.action_space(name).shape[0]] 
+    for name in env.possible_agents}))
+""")
+    assert found == {"left": [226, 26], "right": [232, 26]}
+
+
+@needs_pettingzoo
 def test_what_does_not_fit_is_refused_in_one_sentence():
     from dora.integrations.pettingzoo import make
 
