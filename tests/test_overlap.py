@@ -12,7 +12,6 @@ import dora.tasks as tasks
 from dora.sim.substeps import watch_physics
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.microwave.snapshot import LEFT, RIGHT
-from dora.tasks.microwave.task import MicrowaveTask
 
 OVEN = ("handle", "door", "body")
 """Names of the bodies of the microwave."""
@@ -26,9 +25,9 @@ HIDDEN = {"DoraMicrowave-v1": 0.3, "DoraJug-v1": 1.6}
 def groups_of(task: DoraEnv) -> dict[str, list[Any]]:
     """Links of each arm, objects, and what the microwave is made of, by name."""
     arms = {name: list(arm.agent.robot.links) for name, arm in task.arms.items()}
-    owner: Any = task.task
-    oven = owner.oven.links if isinstance(owner, MicrowaveTask) else {}
-    return {**arms, **{name: [o] for name, o in task.objects.items()}, **{name: [oven[name]] for name in oven}}
+    oven = getattr(task.task, "oven", None)
+    links = {name: [oven.links[name]] for name in OVEN} if oven else {}
+    return {**arms, **{name: [o] for name, o in task.objects.items()}, **links}
 
 
 def reported_and_true(env: str, n: int, persistent: bool | None = None) -> tuple[np.ndarray, np.ndarray]:
