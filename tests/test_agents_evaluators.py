@@ -150,7 +150,7 @@ def test_seeds_of_evaluations_do_not_meet():
 @pytest.mark.parametrize(
     ("failure", "error", "message"),
     [
-        ("ends", RuntimeError, "a worker process died"),
+        ("ends", RuntimeError, "A worker process died"),
         ("fails", KeyError, "no step here"),
         ("refuses", InputError, "^The action is NaN.$"),
     ],
@@ -181,7 +181,7 @@ def test_a_helper_that_is_gone_is_reported():
     [helper] = helpers()
     helper.kill()
     helper.join()
-    with pytest.raises(RuntimeError, match="a worker process died"):
+    with pytest.raises(RuntimeError, match="A worker process died"):
         evaluators.run(None, EPISODES, 0)
     assert not helpers()
     evaluators.close()
