@@ -279,6 +279,29 @@ def test_states_with_objects_of_other_sizes_leave_the_random_numbers_of_the_othe
         env.close()
 
 
+def test_states_with_objects_of_other_sizes_leave_the_others_as_if_their_own_state_were_set():
+    """At the sizes of the preset: PhysX forgets contacts, here of fingers with each other and the cube, and no more."""
+    env = make(OURS, 3, preset="standard", config=None)
+    moved(env, 1, 12)
+    state = _rows(base(env).get_state_dict(), [0, 2])
+    steps = 0.5 * np.random.default_rng(9).uniform(-1, 1, (3, *(env.action_space.shape or ())))
+    found = []
+    for way in ("nothing", "own state", "other sizes"):
+        seen, before, sizes = [moved(env, 2, 12)], base(env).get_state(), base(env).scale
+        if way == "own state":
+            base(env).set_state_dict(base(env).get_state_dict())
+        elif way == "other sizes":
+            seen = [env.reset(options={"env_idx": [2, 0], START: {"env_states": state}})[0]]
+            assert not torch.equal(base(env).scale[[0, 2]], sizes[[0, 2]])
+            torch.testing.assert_close(base(env).get_state()[1], before[1], rtol=0, atol=1e-6)
+        found.append(torch.stack([*seen, *(env.step(a)[0] for a in steps)])[:, 1])
+    wanted, own, other = found
+    assert (other[0] - wanted[0]).abs().max() < 1e-3
+    assert (other - wanted).abs().max() < 0.2
+    assert (other - own)[1:].abs().max() < 0.02
+    env.close()
+
+
 @pytest.mark.parametrize("resets", [6, 2])
 def test_cached_resets(env: Any, resets: int):
     wrapped: Any = CachedResetWrapper(env, config={"num_resets": resets, "seed": 0})  # pyright: ignore[reportArgumentType]
