@@ -252,7 +252,7 @@ def test_a_policy_keeps_its_numbers_of_the_task_under_another_preset():
 
 
 def test_forces_are_those_that_the_task_reads(hammer: Watched):
-    state = hammer.steps(120)
+    state = hammer.steps(45)
     assert state.episode.stage >= 2
     hand = hammer.env.snapshot.hand
     parts = ("thumb", "index", "middle", "ring", "pinky", "palm")

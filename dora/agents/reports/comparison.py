@@ -331,7 +331,7 @@ def _failures(runs: Sequence[Run]) -> Section:
     return Section("Why episodes fail", head, rows, "By the first stage that was not reached, or overlap alone.")
 
 
-def failure_kinds(tables: Sequence[Mapping[str, Float[np.ndarray, " e"]]]) -> dict[str, float]:
+def failure_kinds(tables: Sequence[Mapping[str, Float[np.ndarray, " _"]]]) -> dict[str, float]:
     """Share of episodes that failed for each reason, the most frequent first.
 
     Args:

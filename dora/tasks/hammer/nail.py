@@ -9,11 +9,10 @@ down, so that it never comes back up: while the nail moves,
 The hammer's blow starts the nail at nearly the hammer's speed and is then spent against drag and resistance. Pushing
 moves it too, and a nail pushed in has not been hammered: a blow is an impact above `blow_speed` of the striking face on
 the nail's head. What the nail sinks within `blow_window` after one counts as driven while nothing but that face presses
-on the nail, and no more of it than the momentum of the hammer alone could drive (`free_depth`): what the hand adds by
-pushing on after a touch does not count.
+on the nail, and only as long as the nail is no faster than the momentum of hammer and hand by itself would drive it
+(`slowed`): once it is pushed on after a touch, the blow is over.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,11 +47,9 @@ WATCHED = 0.3
 FACE_DEPTH, FACE_EDGE = 0.006, 0.003
 """How far from the plane and beyond the edge of the striking face a contact point may lie that is on it [m]; the
 point of a contact lies between the two surfaces, which a blow presses into each other."""
-SMALL_DRAG = 1e-3
-"""Drag as a share of the resistance below which it is left out of `free_depth` [1]."""
 UPRIGHT = 0.7
 """Smallest vertical share of a contact's normal that presses the nail down, not aside [1]."""
-STATE = ("_depth", "_driven", "_since", "_speed", "_spare")
+STATE = ("_depth", "_driven", "_since", "_speed", "_free")
 """Buffers of a nail that its state holds."""
 DOWN = (0.7071068, 0.0, 0.7071068, 0.0)
 """Turns +x, the axis of joints and cylinders, into -z (wxyz): the joint's coordinate is the nail's depth."""
@@ -82,23 +79,21 @@ class NailSettings:
     """Speed of the striking face relative to the nail above which an impact is a blow [m/s]."""
     blow_window: float = 0.05
     """Time after a blow in which the nail's motion counts as driven, if nothing else touches the nail [s]."""
+    hand: float = 1.5
+    """Mass that strikes with the hammer, that of the DLR/HIT Hand II [kg]."""
 
 
-def free_depth(settings: NailSettings, speed: float, mass: float) -> float:
-    """How far a free hammer drives the nail, at most [m].
-
-    Hammer and nail go on together with the hammer's momentum, m v' = -resistance - drag * v until they stand.
+def slowed(settings: NailSettings, speed: float, mass: float, dt: float) -> float:
+    """Speed of a nail after a moment in which nothing but the momentum of what struck it drives it on [m/s].
 
     Args:
         settings: numbers of the nail.
-        speed: of the hammer relative to the nail before the impact [m/s].
-        mass: of the hammer [kg].
+        speed: of the nail and of what struck it, before [m/s].
+        mass: of what struck it [kg].
+        dt: length of the moment [s].
     """
-    both, r, d = mass + settings.mass, settings.resistance, settings.drag
-    speed *= mass / both
-    if d * speed < SMALL_DRAG * r:
-        return both * speed * speed / (2 * r)
-    return both / d * (speed - r / d * math.log1p(d * speed / r))
+    force = settings.resistance + settings.drag * speed
+    return max(speed - dt * force / (mass + settings.mass), 0.0)
 
 
 class Nail:
@@ -122,7 +117,7 @@ class Nail:
         self._driven = np.zeros(n, np.float32)
         self._since = np.full(n, settings.blow_window, np.float32)
         self._speed = np.zeros(n, np.float32)
-        self._spare = np.zeros(n, np.float32)
+        self._free = np.zeros(n, np.float32)
         self._hammers: list[sapien.physx.PhysxRigidDynamicComponent] = []
         self._faces: Float[np.ndarray, "n 3"] = np.zeros((n, 3))
         self._radii: Float[np.ndarray, " n"] = np.zeros(n)
@@ -146,7 +141,7 @@ class Nail:
         self.articulation.set_qpos(torch.zeros(len(rows), 1, device=self._device))
         self.articulation.set_qvel(torch.zeros(len(rows), 1, device=self._device))
         index = rows.cpu().numpy()
-        for buffer in (self._depth, self._driven, self._speed, self._spare):
+        for buffer in (self._depth, self._driven, self._speed, self._free):
             buffer[index] = 0.0
         self._since[index] = self.settings.blow_window
         self._hold(index.tolist())
@@ -173,23 +168,29 @@ class Nail:
         body, before = self._bodies[i], self._depth[i]
         depth = float(body.qpos[0])
         self._since[i] += self._dt
+        if self._free[i] > 0:
+            self._free[i] = slowed(self.settings, float(self._free[i]), self._mass(i), self._dt)
         if depth > before + MOVED:
             face, other = self._pressed(i, contacts)
             if face and self._speed[i] > self.settings.blow_speed:
                 self._strike(i)
-            if self._since[i] < self.settings.blow_window and not other:
-                counted = min(depth - before, self._spare[i])
-                self._driven[i] += counted
-                self._spare[i] -= counted
+            if self._since[i] < self.settings.blow_window and not other and body.qvel[0] <= self._free[i]:
+                self._driven[i] += depth - before
+            else:
+                self._free[i] = 0.0
             self._depth[i] = depth
             self._limit(i)
         self._speed[i] = self._approach(i, float(body.qvel[0]))
 
     def _strike(self, i: int) -> None:
         """A blow begins, or goes on in the next physics step."""
-        spare = self._spare[i] if self._since[i] < self.settings.blow_window else 0.0
-        self._spare[i] = max(spare, free_depth(self.settings, float(self._speed[i]), self._hammers[i].mass))
+        mass = self._mass(i)
+        self._free[i] = max(self._free[i], self._speed[i] * mass / (mass + self.settings.mass))
         self._since[i] = 0.0
+
+    def _mass(self, i: int) -> float:
+        """Mass that strikes in environment i [kg]."""
+        return float(self._hammers[i].mass) + self.settings.hand
 
     def _pressed(self, i: int, contacts: list) -> tuple[bool, bool]:
         """Whether the striking face pressed the nail down in the last physics step, and whether anything else touched
