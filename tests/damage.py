@@ -116,30 +116,41 @@ def peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def probe(name: str, loader: Loader, count: int, folder: Path, seed: int = 0) -> Outcome:
-    """Damages files of a loader, each in one way, and loads them."""
-    intact, copy = folder / "intact", folder / "copy"
-    intact.mkdir(parents=True)
-    loader.make(intact)
-    loader.load(intact)
-    draw, outcome, before = random.Random(f"{name} {seed}"), Outcome(), peak()
-    files = sorted(path for pattern in loader.damaged for path in intact.rglob(pattern) if path.is_file())
-    assert files, f"{name} has no files to damage"
-    for _ in range(count):
-        path = draw.choice(files)
+class Probe:
+    """Damages files of a loader, each in one way, and loads them.
+
+    Args:
+        name: of the loader.
+        loader: what is probed.
+        folder: an empty one, for the intact files and for a damaged copy.
+    """
+
+    def __init__(self, name: str, loader: Loader, folder: Path):
+        self.intact, self.copy, self.loader, self.outcome = folder / "intact", folder / "copy", loader, Outcome()
+        self.intact.mkdir(parents=True)
+        loader.make(self.intact)
+        loader.load(self.intact)
+        self._before = peak()
+        self.files = sorted(path for pattern in loader.damaged for path in self.intact.rglob(pattern) if path.is_file())
+        assert self.files, f"{name} has no files to damage"
+
+    def damage(self, draw: random.Random) -> None:
+        """Loads the files after one of them was damaged, and counts what became of it."""
+        path = draw.choice(self.files)
         content = path.read_bytes()
         damaged = draw.choice(DAMAGES)(content, draw)
         if damaged == content:
-            continue
-        shutil.rmtree(copy, ignore_errors=True)
-        shutil.copytree(intact, copy)
-        (copy / path.relative_to(intact)).write_bytes(damaged)
+            return
+        shutil.rmtree(self.copy, ignore_errors=True)
+        shutil.copytree(self.intact, self.copy)
+        (self.copy / path.relative_to(self.intact)).write_bytes(damaged)
+        outcome = self.outcome
         outcome.probes += 1
         start = time.perf_counter()
         try:
             with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
                 warnings.simplefilter("ignore")
-                loader.load(copy)
+                self.loader.load(self.copy)
             outcome.accepted += 1
         except InputError as error:
             outcome.refused += 1
@@ -148,8 +159,15 @@ def probe(name: str, loader: Loader, count: int, folder: Path, seed: int = 0) ->
         except Exception as error:
             outcome.tracebacks.append(f"{path.name}: {type(error).__name__}: {error}"[:300])
         outcome.slowest = max(outcome.slowest, time.perf_counter() - start)
-    outcome.grown = peak() - before
-    return outcome
+        outcome.grown = peak() - self._before
+
+
+def probe(name: str, loader: Loader, count: int, folder: Path, seed: int = 0) -> Outcome:
+    """Damages files of a loader `count` times."""
+    one, draw = Probe(name, loader, folder), random.Random(f"{name} {seed}")
+    for _ in range(count):
+        one.damage(draw)
+    return one.outcome
 
 
 def main(words: list[str]) -> int:
