@@ -66,6 +66,7 @@ def test_all_tests_of_tasks_pass_on_it(added: tuple[Path, dict[str, str]], proje
     assert count >= 17, done.stdout[-500:]
 
 
+@pytest.mark.slow
 def test_its_page_and_its_settings_follow_from_the_file(added: tuple[Path, dict[str, str]]):
     root, env = added
     page = root / "block.md"

@@ -42,6 +42,7 @@ def test_an_arm_sees_its_own_entries_and_the_shared_ones():
     assert columns_by_arm(["arm"], {"q": 2, "stage": 1}) == {"arm": [0, 1, 2]}
 
 
+@pytest.mark.slow
 def test_columns_of_two_arms_are_those_of_their_entries():
     found = in_process("""
 from dora.agents.collecting.task_env import TaskEnv

@@ -144,6 +144,7 @@ def test_candidates_go_through_what_all_searches_share(found):
     assert not found.position.requires_grad
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_candidates_and_other_kinematics_another_digest(found):
     again = optimise(CUBE, ROBOT, 8, 0, "body", QUICK, device="cpu", kinematics="pytorch_kinematics")
     assert torch.equal(again.position, found.position)

@@ -12,7 +12,10 @@ from dora.tasks.mdp.guidance_parts import PARTS
 from dora.tools.filter_benchmark import outcomes
 
 
-@pytest.mark.parametrize(("env_id", "config"), [("DoraCube-v1", {"optimised": True}), ("DoraJug-v1", {})])
+@pytest.mark.parametrize(
+    ("env_id", "config"),
+    [pytest.param("DoraCube-v1", {"optimised": True}, marks=pytest.mark.slow), ("DoraJug-v1", {})],
+)
 def test_grasps_take_away_the_regions_and_nothing_else(env_id: str, config: dict[str, Any]):
     made = [tasks.make_task(env_id, 4, guidance=g, config=config) for g in ("affordance", "grasps", "none")]
     whole, grasps, plain = made

@@ -343,6 +343,7 @@ def test_the_handle_is_the_object_of_the_left_arm_and_no_part_of_the_world(task:
     assert {link.name.rpartition("-")[2] for link in task.task.world(task.task_scene)[1:]} == {"body", "door"}
 
 
+@pytest.mark.slow
 def test_a_restored_state_has_the_same_microwave_and_goes_on_alike(task: Any):
     task.reset(seed=2)
     run(task, 70)
@@ -360,6 +361,7 @@ def test_a_restored_state_has_the_same_microwave_and_goes_on_alike(task: Any):
     torch.testing.assert_close(again.cube_p, after.cube_p, atol=1e-3, rtol=0)
 
 
+@pytest.mark.slow
 def test_stages_of_the_arms_go_on_side_by_side(task: Any):
     task.reset(seed=4)
     together = False

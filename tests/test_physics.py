@@ -17,6 +17,7 @@ def test_settings_that_make_no_sense_are_refused(text: str):
         parse_physics(text)
 
 
+@pytest.mark.slow
 def test_settings_reach_the_simulation():
     """A coarse solver that sees contacts late lets the cube and the fingers overlap more."""
     seen = []

@@ -168,7 +168,7 @@ def test_partial_reset_leaves_the_others_bit_identical(batch: DoraEnv, which: li
         assert torch.equal(batch.step(a)[0][others], whole[13 + t][others])
 
 
-@pytest.mark.parametrize("env_id", slow_for("DoraJug-v1", "DoraMicrowave-v1"))
+@pytest.mark.parametrize("env_id", slow_for("DoraJug-v1", "DoraHammer-v1", "DoraMicrowave-v1"))
 def test_a_batch_equals_singles(env_id: str):
     seeds = [11, 12, 13]
     task = tasks.make_task(env_id, len(seeds))
