@@ -63,7 +63,7 @@ class NailSettings:
 
     top: tuple[float, float, float] = (0.65, -0.14, 0.30)
     """Top of the undriven nail, world frame [m]."""
-    travel: float = 0.025
+    travel: float = 0.05
     """How far the nail can sink [m]."""
     driven: float = 0.010
     """How far blows must drive it [m]."""
