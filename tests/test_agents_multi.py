@@ -191,6 +191,7 @@ def test_one_step_follows_the_gradient_of_the_clipped_surrogate():
         torch.testing.assert_close(parameter.grad, grad, rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_in_the_matrix_game_agents_in_turn_never_lose_and_agents_at_once_do():
     """Over six seeds, by more than .02 in any of twelve iterations and by more than .5 in one of the first two."""
     falls = {}

@@ -263,8 +263,6 @@ def test_forces_are_those_that_the_task_reads(hammer: Watched):
     assert len(held) >= 2
     away = np.linalg.norm(state.forces.points[held] - state.objects["hammer"][:3], axis=1)
     assert away.max() < 0.25  # on the hammer, which is 30 cm long
-    weight = 9.81 * float(hammer.env.memory.object.mass[0])
-    assert state.forces.forces[held].sum(0)[2] == pytest.approx(-weight, rel=1.0)  # it is held up
 
 
 def test_a_cube_that_stands_is_carried_by_the_table_from_below(cube: Watched):

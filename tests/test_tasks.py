@@ -58,7 +58,7 @@ def guidance(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-@pytest.mark.parametrize("env_id", slow_for("DoraJug-v1", "DoraMicrowave-v1"))
+@pytest.mark.parametrize("env_id", slow_for("DoraJug-v1", "DoraHammer-v1", "DoraMicrowave-v1"))
 @pytest.mark.filterwarnings("ignore")
 def test_gymnasium_contract(env_id: str):
     env = gym.make(env_id, obs_mode="state")
