@@ -237,6 +237,21 @@ def test_a_seed_chooses_the_starts_of_an_evaluation(
 
 
 @pytest.mark.usefixtures("point_mass")
+def test_a_run_that_has_ended_is_not_evaluated_again(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    words = "--env DoraCube-v1 --total-steps 2048 --num-envs 16 --workers 0 --episodes 5 --no-zero-correction --out"
+    folder = str(tmp_path / "run")
+    assert call(script, monkeypatch, *words.split(), folder) == 0
+    before = (tmp_path / "run" / "result.json").read_bytes()
+    assert call(script, monkeypatch, "--resume", folder, "--no-zero-correction") == 2
+    assert "has ended, its figures are in result.json" in capsys.readouterr().err.splitlines()[-1]
+    assert (tmp_path / "run" / "result.json").read_bytes() == before
+    assert call(script, monkeypatch, "--resume", folder, "--no-zero-correction", "--total-steps", "4096") == 0
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["env_steps"] >= 4096
+
+
+@pytest.mark.usefixtures("point_mass")
 def test_a_film_comes_before_the_evaluation_that_was_asked_for_with_it(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

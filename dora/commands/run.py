@@ -33,6 +33,7 @@ from dora.agents.runs.interrupt import STATUS, ending_at_once
 from dora.agents.runs.logging import add_film
 from dora.agents.runs.recommended import learners_of, recommended
 from dora.agents.runs.run_folder import RunFolder, make_result
+from dora.agents.runs.stored_results import read_result
 from dora.agents.runs.trainer import Trainer
 from dora.configs import plain
 from dora.errors import FAILED, RECORDS, InputError, RunFailure, command
@@ -160,6 +161,21 @@ def refuse_other_settings(folder: Path, stored: RunConfig, asked: RunConfig) -> 
             )
 
 
+def refuse_finished(folder: Path, total_steps: int) -> None:
+    """Refuses to go on with a run that has ended, whose last evaluation would only be repeated.
+
+    Raises:
+        InputError: it has been trained for `total_steps`, and its result is written.
+    """
+    path = folder / "result.json"
+    result = read_result(path) if path.is_file() else None
+    if result is not None and result.get("total_steps", 0) >= total_steps:
+        raise InputError(
+            f"The run in {folder} has ended, its figures are in result.json: give a larger --total-steps to go on, "
+            f"or evaluate its policy by --eval-only --checkpoint {folder}."
+        )
+
+
 def default_folder(config: RunConfig, agent: str, suffix: str = "") -> Path:
     """runs/<env>/<agent>-<guidance>-s<seed>-<time>."""
     time = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
@@ -181,6 +197,7 @@ def train(args: Args) -> tuple[Path, int]:
     folder = RunFolder(args.resume or args.out or default_folder(config, config.agent))
     if args.resume is not None:
         refuse_other_settings(args.resume, folder.read_config(), config)
+        refuse_finished(args.resume, config.total_steps)
     else:
         folder.create(config)
     with folder.locked():
