@@ -151,7 +151,7 @@ def resumed(outcome: Outcome, folder: Path) -> None:
     if not (folder / "config.yaml").exists():
         return  # nothing was begun
     done = subprocess.run(command("--resume", str(folder)), capture_output=True, text=True)
-    if done.returncode != 0:
+    if done.returncode != 0 and "has ended" not in done.stderr:  # it may have come to its end first
         outcome.problems.append(f"cannot be resumed: {done.stderr.strip().splitlines()[-1]}")
     if still := sorted(path for path in outcome.left if Path(path).exists()):
         outcome.problems.append(f"left for good: {', '.join(still)}")
