@@ -184,9 +184,10 @@ def test_a_batch_equals_singles(env_id: str):
 
 @pytest.mark.parametrize("env_id", slow_for("DoraHammer-v1", "DoraMicrowave-v1"))
 def test_the_script_visits_every_stage_in_order_and_succeeds(env_id: str, guidance: str):
-    task = tasks.make_task(env_id, 16, guidance=guidance, preset="none")
+    n = 48 if env_id == "DoraHammer-v1" else 16  # of 16 starts three more or less of its blows hit
+    task = tasks.make_task(env_id, n, guidance=guidance, preset="none")
     task.reset(seed=5)
-    seen, rewards, success = [], [], torch.zeros(16, dtype=torch.bool)
+    seen, rewards, success = [], [], torch.zeros(n, dtype=torch.bool)
     for _ in range(task.max_steps):
         _, reward, _, _, info = task.step(task.scripted_action())
         seen.append(info["stage"])
