@@ -10,7 +10,7 @@ import torch
 torch.set_num_threads(1)
 
 LONG = (
-    "test_tasks.py", "test_agents_train.py", "test_run_failures.py", "test_adding_a_task.py", "test_hammer.py",
+    "test_tasks.py", "test_agents_train.py", "test_run_failures.py", "test_adding_a_task.py", "test_nail.py",
     "test_cameras.py", "test_camera_settings.py",
 )  # fmt: skip
 """Modules that take longest; they come first, so that no process is left with one of them when the others are done."""

@@ -1,5 +1,6 @@
 """Overlap is looked for in every physics step, between everything that an arm or an object may touch."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -73,12 +74,17 @@ def test_persistent_contacts_hide_no_more_than_was_measured(env: str, n: int):
     assert np.quantile(true - reported, 0.9) <= HIDDEN[env]
 
 
-@pytest.fixture
-def task() -> Any:
-    made = tasks.make_task("DoraCube-v1", 2, preset="none")
+def at_the_start(env_id: str) -> Iterator[DoraEnv]:
+    """Two environments without randomisation, closed in the end."""
+    made = tasks.make_task(env_id, 2, preset="none")
     made.reset(seed=0)
     yield made
     made.close()
+
+
+@pytest.fixture
+def task() -> Iterator[DoraEnv]:
+    yield from at_the_start("DoraCube-v1")
 
 
 def shifted(pose: sapien.Pose, up: float) -> sapien.Pose:
@@ -140,11 +146,8 @@ def test_one_environment_reports_the_same_as_a_batch():
 
 
 @pytest.fixture
-def two_arms() -> Any:
-    made = tasks.make_task("DoraMicrowave-v1", 2, preset="none")
-    made.reset(seed=0)
-    yield made
-    made.close()
+def two_arms() -> Iterator[DoraEnv]:
+    yield from at_the_start("DoraMicrowave-v1")
 
 
 IN_OVEN = {"body": ((0.17, 0.15, 0.12), 1), "door": ((-0.06, 0.0, 0.12), 0)}

@@ -5,11 +5,7 @@ import functools
 import json
 import math
 import os
-import shutil
 import signal
-import subprocess
-import sys
-import tempfile
 import time
 from multiprocessing import parent_process
 from pathlib import Path
@@ -22,21 +18,18 @@ from fake_task import PointMass
 from test_agents_train import BASE, SMALL_PPO, SMALL_SAC, children, run, weights
 from torch import Tensor
 
-from dora import parallel
 from dora.agents.checkpoint import read_checkpoint
 from dora.agents.collecting import rollouts
 from dora.agents.collecting.task_env import TaskEnv
 from dora.agents.config import HAPPOConfig
 from dora.agents.evaluation.evaluators import Evaluators
-from dora.agents.evaluation.play import load_policy
 from dora.agents.learners.finite import check_loss, check_modules
 from dora.agents.runs.interrupt import IMPATIENT, Interrupt
 from dora.agents.runs.run_folder import RunFolder
 from dora.agents.runs.trainer import Trainer
 from dora.commands import run as run_command
 from dora.commands.interruptions import command, interrupt
-from dora.errors import InputError, RunFailure, WorkerFailure
-from dora.parallel import name_of_process
+from dora.errors import RunFailure, WorkerFailure
 
 SHORT = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=1536, eval_every=512, stagger=False)
 SHORT_SAC = dataclasses.replace(SHORT, agent="sac", learner=SMALL_SAC)
@@ -318,137 +311,3 @@ def test_what_is_half_learned_is_not_saved(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(trainer.learner, "update", half)
     assert not trainer.run()["finished"]
     assert read_checkpoint(folder.latest).progress["env_steps"] == 0
-
-
-@pytest.mark.parametrize(
-    "change", [{"seed": 5}, {"learner": dataclasses.replace(SMALL_PPO, gamma=0.9)}], ids=["seed", "gamma"]
-)
-def test_the_best_policy_of_another_run_is_refused(tmp_path: Path, change: Any):
-    run(tmp_path / "run", SHORT)
-    run(tmp_path / "other", dataclasses.replace(SHORT, **change))
-    best = RunFolder(tmp_path / "run").best
-    shutil.copy(RunFolder(tmp_path / "other").best, best)
-    with pytest.raises(InputError, match=f"{best} belongs to another run"):
-        run(tmp_path / "run", SHORT, resume=True)
-
-
-def test_a_missing_best_policy_is_told(tmp_path: Path):
-    run(tmp_path / "run", SHORT)
-    RunFolder(tmp_path / "run").best.unlink()
-    with pytest.raises(
-        InputError, match=r"best\.safetensors is missing, the best policy of this run so far: put it back"
-    ):
-        run(tmp_path / "run", SHORT, resume=True)
-
-
-def spoilt(path: Path, name: str) -> None:
-    """Write a checkpoint again, with NaN in one of its tensors."""
-    checkpoint = read_checkpoint(path)
-    checkpoint.tensors[name].view(-1)[0] = torch.nan
-    checkpoint.write(path)
-
-
-def test_weights_that_are_not_finite_are_refused_with_their_file(tmp_path: Path):
-    run(tmp_path / "run", SHORT)
-    folder, name = RunFolder(tmp_path / "run"), "actor/mean.0.weight"
-    spoilt(folder.best, name)
-    with pytest.raises(InputError, match=f"{folder.best} holds NaN or infinity in {name}"):
-        load_policy(read_checkpoint(folder.best), folder.best)
-    moment = next(key for key in weights(folder.path) if key.endswith("exp_avg"))
-    spoilt(folder.latest, moment)
-    with pytest.raises(InputError, match=f"{folder.latest} holds NaN or infinity in {moment}"):
-        run(folder.path, SHORT, resume=True)
-
-
-def test_only_one_process_trains_in_a_folder(tmp_path: Path):
-    folder = RunFolder(tmp_path)
-    folder.create(SHORT)
-    with folder.locked(), pytest.raises(InputError, match="Another process is training in"), folder.locked():
-        pass
-    holder = (
-        "import sys, time; from pathlib import Path; from dora.agents.runs.run_folder import RunFolder\n"
-        "with RunFolder(Path(sys.argv[1])).locked(): print('held', flush=True); time.sleep(100)"
-    )
-    process = subprocess.Popen([sys.executable, "-c", holder, str(tmp_path)], stdout=subprocess.PIPE)
-    assert process.stdout is not None
-    assert process.stdout.readline() == b"held\n"
-    with pytest.raises(InputError, match="wait until it ends"), folder.locked():
-        pass
-    process.kill()
-    process.wait()
-    with folder.locked():
-        pass
-
-
-def test_what_a_killed_run_left_half_written_is_removed(tmp_path: Path):
-    folder = RunFolder(tmp_path)
-    folder.create(SHORT)
-    folder.replay.mkdir()
-    halves = [folder.path / ".curve.csv.abcd_123", folder.checkpoints / ".latest.safetensors.zyxw9876"]
-    halves.append(folder.replay / ".0000000000-0000016384.safetensors.aaaaaaaa")
-    others = [folder.path / ".notes", folder.path / ".hidden.toml"]
-    for path in halves + others:
-        path.write_text("half")
-    with folder.locked():
-        assert not any(path.exists() for path in halves)
-        assert all(path.exists() for path in others)
-
-
-def test_a_run_without_a_checkpoint_is_resumed_from_its_beginning(tmp_path: Path):
-    folder = RunFolder(tmp_path / "killed")
-    folder.create(SHORT)  # and killed before the first checkpoint
-    run(folder.path, SHORT, resume=True)
-    run(tmp_path / "straight", SHORT)
-    for name, value in weights(tmp_path / "straight").items():
-        assert torch.equal(value, weights(folder.path)[name]), name
-
-
-def test_a_finished_run_that_goes_on_is_unfinished_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    run(tmp_path / "run", SHORT)
-    result = tmp_path / "run" / "result.json"
-    assert json.loads(result.read_text())["finished"]
-    monkeypatch.setattr(Trainer, "_write_result", lambda *_: {})  # as if killed
-    run(tmp_path / "run", dataclasses.replace(SHORT, total_steps=2048), resume=True)
-    assert not json.loads(result.read_text())["finished"]
-
-
-@pytest.mark.parametrize("content", ["[" * 100_000, '{"finished": true, "a": ' + "[" * 50 + "]" * 50 + "}"])
-def test_a_result_that_is_nested_too_deep_does_not_prevent_a_run(tmp_path: Path, content: str):
-    folder = RunFolder(tmp_path)
-    folder.create(SHORT)
-    (tmp_path / "result.json").write_text(content)
-    folder.mark_unfinished()
-    assert (tmp_path / "result.json").read_text() == content
-
-
-LEAVING = """
-import os, signal, sys
-from multiprocessing import get_context
-from dora.parallel import name_leftovers, name_of_process
-if __name__ == "__main__":
-    name_leftovers()
-    lock = get_context("spawn").Lock()
-    print(name_of_process(), flush=True)
-    os.killpg(0, signal.SIGKILL)
-"""
-
-
-@pytest.mark.skipif(not parallel.SHARED.is_dir(), reason="semaphores have no names here")
-def test_what_killed_processes_left_is_removed_at_the_next_start(tmp_path: Path):
-    """Not before their end, and nothing that another process may use."""
-    script, places = tmp_path / "leaving.py", (parallel.SHARED, Path(tempfile.gettempdir()))
-    script.write_text(LEAVING)
-    done = subprocess.run([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, start_new_session=True)
-    name = done.stdout.strip()
-    left = [path for place in places for path in place.glob(f"*{name}*")]
-    assert done.returncode == -signal.SIGKILL
-    assert len(left) == 2  # a semaphore and a folder
-    own = Path(tempfile.mkdtemp(prefix=name_of_process()))
-    foreign = Path(tempfile.mkdtemp(prefix=name.replace(f"dora-{parallel._namespace()}", "dora-1")))
-    parallel.name_leftovers.cache_clear()
-    parallel.name_leftovers()
-    assert not any(path.exists() for path in left)
-    assert own.exists()
-    assert foreign.exists()
-    own.rmdir()
-    foreign.rmdir()
