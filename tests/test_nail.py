@@ -121,11 +121,13 @@ def test_a_nail_that_nothing_pushes_is_slowed_as_its_equation_says():
     assert slowed(numbers, 0.01, mass, whole) == 0.0
 
 
-def test_a_fast_blow_counts(bench: tasks.DoraEnv):
-    """A face at 3 m/s is more than a centimetre below the nail's head after the step in which it meets it."""
-    over_nail(bench, 0.03, 3.0)
+@pytest.mark.parametrize("gap", [0.02, 0.023, 0.034])
+@pytest.mark.parametrize("speed", [3.0, 4.0])
+def test_a_fast_blow_counts_wherever_it_is_between_two_steps(bench: tasks.DoraEnv, gap: float, speed: float):
+    """The face is up to 17 mm below the nail after the step in which it meets it, or slowed down in the one before."""
+    over_nail(bench, gap, speed)
     depth, driven = run(bench, 4)
-    assert driven == pytest.approx(depth, abs=0.05)
+    assert driven == pytest.approx(depth, abs=0.1)
     assert driven > 5
 
 
