@@ -19,7 +19,7 @@ from dora.geometry.rotations import (
 )
 from dora.sim.substeps import watch_physics
 from dora.tasks.hammer.ballistics import Strike
-from dora.tasks.hammer.nail import slowed
+from dora.tasks.hammer.nail import slowed, struck
 from dora.tasks.hammer.task import HammerConfig, HammerTask
 
 CONFIG = HammerConfig()
@@ -119,6 +119,12 @@ def test_a_nail_that_nothing_pushes_is_slowed_as_its_equation_says():
         fine -= whole / 1000 * (numbers.resistance + numbers.drag * fine) / (mass + numbers.mass)
     assert slowed(numbers, speed, mass, whole) == pytest.approx(fine, abs=0.05)
     assert slowed(numbers, 0.01, mass, whole) == 0.0
+
+
+def test_an_impact_keeps_the_momentum_of_nail_and_hammer():
+    numbers, mass, face, sinking = CONFIG.nail, 1.8, 1.3, 0.4
+    after = struck(numbers, face - sinking, sinking, mass)
+    assert after * (mass + numbers.mass) == pytest.approx(mass * face + numbers.mass * sinking)
 
 
 @pytest.mark.parametrize("gap", [0.02, 0.023, 0.034])

@@ -49,7 +49,7 @@ FACE_DEPTH, FACE_EDGE = 0.006, 0.003
 point of a contact lies between the two surfaces, which a blow presses into each other."""
 UPRIGHT = 0.7
 """Smallest vertical share of a contact's normal that presses the nail down, not aside [1]."""
-STATE = ("_depth", "_driven", "_since", "_speed", "_before", "_free")
+STATE = ("_depth", "_driven", "_since", "_speed", "_before", "_sinking", "_free")
 """Buffers of a nail that its state holds."""
 DOWN = (0.7071068, 0.0, 0.7071068, 0.0)
 """Turns +x, the axis of joints and cylinders, into -z (wxyz): the joint's coordinate is the nail's depth."""
@@ -96,6 +96,18 @@ def slowed(settings: NailSettings, speed: float, mass: float, dt: float) -> floa
     return max(speed - dt * force / (mass + settings.mass), 0.0)
 
 
+def struck(settings: NailSettings, speed: float, sinking: float, mass: float) -> float:
+    """Speed of a nail right after an impact that is not elastic: of the momentum of both [m/s].
+
+    Args:
+        settings: numbers of the nail.
+        speed: of what strikes, relative to the nail [m/s].
+        sinking: of the nail, before [m/s].
+        mass: of what strikes [kg].
+    """
+    return sinking + speed * mass / (mass + settings.mass)
+
+
 class Nail:
     """One upright nail per environment, in a post that stands on the table.
 
@@ -118,6 +130,7 @@ class Nail:
         self._since = np.full(n, settings.blow_window, np.float32)
         self._speed = np.zeros(n, np.float32)
         self._before = np.zeros(n, np.float32)
+        self._sinking = np.zeros(n, np.float32)
         self._free = np.zeros(n, np.float32)
         self._hammers: list[sapien.physx.PhysxRigidDynamicComponent] = []
         self._faces: Float[np.ndarray, "n 3"] = np.zeros((n, 3))
@@ -142,7 +155,7 @@ class Nail:
         self.articulation.set_qpos(torch.zeros(len(rows), 1, device=self._device))
         self.articulation.set_qvel(torch.zeros(len(rows), 1, device=self._device))
         index = rows.cpu().numpy()
-        for buffer in (self._depth, self._driven, self._speed, self._before, self._free):
+        for buffer in (self._depth, self._driven, self._speed, self._before, self._sinking, self._free):
             buffer[index] = 0.0
         self._since[index] = self.settings.blow_window
         self._hold(index.tolist())
@@ -171,26 +184,27 @@ class Nail:
         self._since[i] += self._dt
         if self._free[i] > 0:
             self._free[i] = slowed(self.settings, float(self._free[i]), self._mass(i), self._dt)
-        struck = False
+        blow = False
         if depth > before + MOVED:
             face, other = self._pressed(i, contacts)
             speed = float(max(self._speed[i], self._before[i]))  # PhysX slows a face down in the step before it touches
-            struck = face and speed > self.settings.blow_speed
-            if struck:
-                self._strike(i, speed)
+            blow = face and speed > self.settings.blow_speed
+            if blow:
+                self._strike(i, speed, float(self._sinking[i]) if speed == self._speed[i] else 0.0)
             if self._since[i] < self.settings.blow_window and not other and body.qvel[0] <= self._free[i]:
                 self._driven[i] += depth - before
             else:
                 self._free[i] = 0.0
             self._depth[i] = depth
             self._limit(i)
-        self._before[i] = 0.0 if struck else self._speed[i]
-        self._speed[i] = self._approach(i, float(body.qvel[0]))
+        self._before[i] = 0.0 if blow else self._speed[i]
+        self._sinking[i] = sinking = float(body.qvel[0])
+        self._speed[i] = self._approach(i, sinking)
 
-    def _strike(self, i: int, speed: float) -> None:
-        """A blow begins, or goes on in the next physics step, at a speed of the face relative to the nail [m/s]."""
-        mass = self._mass(i)
-        self._free[i] = max(self._free[i], speed * mass / (mass + self.settings.mass))
+    def _strike(self, i: int, speed: float, sinking: float) -> None:
+        """A blow begins, or goes on in the next physics step: of the face at a speed relative to the nail, which sinks
+        already [m/s]."""
+        self._free[i] = max(self._free[i], struck(self.settings, speed, sinking, self._mass(i)))
         self._since[i] = 0.0
 
     def _mass(self, i: int) -> float:
@@ -208,8 +222,8 @@ class Nail:
             hammer = self._hammers[i] in (one, two)
             for point in contact.points:
                 if point.impulse.any():
-                    struck = hammer and self._on_face(i, point)
-                    face, other = face or struck, other or not struck
+                    striking = hammer and self._on_face(i, point)
+                    face, other = face or striking, other or not striking
         return face, other
 
     def _on_face(self, i: int, point: sapien.physx.PhysxContactPoint) -> bool:
