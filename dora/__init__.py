@@ -38,10 +38,15 @@ def load_policy(which: "str | _Path") -> "TaskPolicy":
 
 
 def _is_command() -> bool:
-    """Whether Python starts `dora` or `python -m dora`, which registers everything when it knows what to do."""
+    """Whether Python starts `dora` or `python -m dora`, which registers everything when it knows what to do.
+
+    A process that such a command starts has its `argv`, but not its command line, and registers everything.
+    """
     program, arguments = _sys.argv[0], _sys.argv[1:]
     asked = _sys.orig_argv[: len(_sys.orig_argv) - len(arguments)]
-    return asked[-1] in ("dora", "-mdora") if program == "-m" else _Path(program).name in ("dora", "dora.exe")
+    if program == "-m":
+        return asked[-1] in ("dora", "-mdora")
+    return program in _sys.orig_argv and _Path(program).name in ("dora", "dora.exe")
 
 
 if not _is_command():

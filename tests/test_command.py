@@ -131,6 +131,26 @@ def test_the_import_registers_everything_elsewhere(tmp_path: Path):
     assert run(sys.executable, "dora_script.py", cwd=tmp_path).stdout.endswith("found\n")
 
 
+SPAWNING = """
+import sys
+from multiprocessing import get_context
+
+if __name__ == "__main__":
+    check = "import dora, gymnasium; gymnasium.spec('DoraCube-v1')"
+    child = get_context("spawn").Process(target=exec, args=(check,))
+    child.start()
+    child.join()
+    sys.exit(child.exitcode)
+"""
+"""A program that looks at the registry in a process of its own."""
+
+
+def test_the_import_registers_everything_in_a_process_that_a_command_starts(tmp_path: Path):
+    (tmp_path / "dora").write_text(SPAWNING)
+    result = subprocess.run([sys.executable, tmp_path / "dora"], capture_output=True, text=True, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+
+
 @pytest.mark.parametrize("shell", command.SHELLS)
 def test_completion_knows_commands_and_options(capsys: pytest.CaptureFixture[str], shell: str):
     assert command.main(["--completion", shell]) == 0
