@@ -159,11 +159,10 @@ def test_completion_knows_commands_and_options(capsys: pytest.CaptureFixture[str
         assert word in script
 
 
-def test_without_maniskill_one_sentence_says_how_to_add_it():
+def test_without_maniskill_one_sentence_says_how_to_add_it(tmp_path: Path):
     code = "import sys; sys.modules['mani_skill'] = None; "
-    call = run(
-        sys.executable, "-c", f"{code} sys.argv[0] = 'dora'; from dora.__main__ import start; sys.exit(start(['run']))"
-    )
+    (tmp_path / "dora").write_text(f"{code} from dora.__main__ import start; sys.exit(start(['run']))")
+    call = run(sys.executable, str(tmp_path / "dora"))
     assert call.returncode == errors.BAD_INPUT
     assert call.stderr.startswith("ManiSkill is not installed: add it by `pip install --no-deps mani-skill==")
     assert call.stderr.count("\n") == 1
