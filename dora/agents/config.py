@@ -130,6 +130,8 @@ class SACConfig:
 
 NEUTRAL = {"arm_effort": 1.0, "pose_filter": 1.0, "placed_after_overlap": 0.0}
 """Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
+UNUSED = {"reward": "dense", "after_success": None}
+"""The same of settings of the run."""
 CONSTANT_PULL = {"prior_last": None, "prior_steps": 100_000}
 """Settings of a pull that does not change."""
 NEUTRAL_LEARNER = {name: {"prior": 0.0, **CONSTANT_PULL} for name in ("ppo", "mappo", "happo")} | {"sac": CONSTANT_PULL}
@@ -185,6 +187,9 @@ class RunConfig(Generic[Numbers, Settings, Agent]):
     """Observations after which the observation normaliser stays as it is."""
     stagger: bool = True
     """End the first episodes at random steps, so that resets spread over time."""
+    after_success: int | None = None
+    """Control steps after its first success at which an episode of the training is truncated, so that the budget goes
+    into what has not been learned; None: it goes on to its limit. Evaluations always do."""
     task: Numbers = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
     """Numbers of the task, all of them: weights, thresholds, randomisation, rates."""
     learner: Settings = field(default_factory=PPOConfig)  # pyright: ignore[reportAssignmentType]
@@ -205,14 +210,14 @@ class RunConfig(Generic[Numbers, Settings, Agent]):
 
     def digest(self) -> str:
         """Twelve hexadecimal digits that differ between settings; `total_steps` may grow and is left out. So are the
-        dense reward and the numbers of `NEUTRAL` and `NEUTRAL_LEARNER` that change nothing, for settings of versions
-        that had no other."""
+        settings of `UNUSED` and the numbers of `NEUTRAL` and `NEUTRAL_LEARNER` that change nothing, for settings of
+        versions that had no other."""
         return digest_of(_digested(plain(self)))[:DIGITS]
 
 
 def _digested(content: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that enter a digest."""
-    left_out = {"total_steps"} | ({"reward"} if content.get("reward") == "dense" else set())
+    left_out = {"total_steps"} | {name for name, value in UNUSED.items() if content.get(name) == value}
     task = {name: value for name, value in content.get("task", {}).items() if NEUTRAL.get(name) != value}
     neutral, learner = NEUTRAL_LEARNER.get(content.get("agent", ""), {}), content.get("learner", {})
     learner = {name: value for name, value in learner.items() if neutral.get(name) != value}

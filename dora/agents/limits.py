@@ -19,6 +19,7 @@ RUN = {
     "final_episodes": (1, 1_000_000),
     "eval_envs": (1, 100_000),
     "stop_success": (0, 1),
+    "after_success": (0, 10**12),
     "checkpoint_seconds": (0, 10**9),
     "normaliser_samples": (0, 10**12),
 }

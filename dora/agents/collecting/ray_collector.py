@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
-from dora.agents.collecting.task_env import TaskEnv, TaskFactory
+from dora.agents.collecting.task_env import EpisodeEnds, TaskEnv, TaskFactory
 from dora.agents.learners.networks import Policy
 from dora.errors import InputError, WorkerFailure, said
 
@@ -27,7 +27,9 @@ class ActorCollector(Collector):
         return True
 
 
-def ray_collector(make_task: TaskFactory, policy: Policy, *, frames: int, seeds: Sequence[int], stagger: bool) -> Any:
+def ray_collector(
+    make_task: TaskFactory, policy: Policy, *, frames: int, seeds: Sequence[int], ends: EpisodeEnds
+) -> Any:
     """A collector whose workers, one for each seed, are actors of a Ray cluster; each takes one core.
 
     The cluster is that of the environment variable RAY_ADDRESS, else one of this machine alone.
@@ -37,7 +39,7 @@ def ray_collector(make_task: TaskFactory, policy: Policy, *, frames: int, seeds:
         policy: whose weights the workers get by `update_policy_weights_`.
         frames: transitions of a batch, of all workers.
         seeds: of their tasks and their exploration.
-        stagger: see `TaskEnv`.
+        ends: see `TaskEnv`.
 
     Raises:
         InputError: Ray is not installed, or no cluster answers.
@@ -59,7 +61,7 @@ def ray_collector(make_task: TaskFactory, policy: Policy, *, frames: int, seeds:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         return RayCollector(
-            [functools.partial(_worker_env, make_task, seed, stagger) for seed in seeds],
+            [functools.partial(_worker_env, make_task, seed, ends) for seed in seeds],
             policy,
             collector_class=ActorCollector,  # pyright: ignore[reportArgumentType]
             frames_per_batch=frames,
@@ -71,12 +73,12 @@ def ray_collector(make_task: TaskFactory, policy: Policy, *, frames: int, seeds:
         )
 
 
-def _worker_env(make_task: TaskFactory, seed: int, stagger: bool) -> TaskEnv:
+def _worker_env(make_task: TaskFactory, seed: int, ends: EpisodeEnds) -> TaskEnv:
     """The environment of a worker, in its process."""
     torch.set_num_threads(1)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     torch.manual_seed(seed)
-    return TaskEnv(make_task(), seed=seed, stagger=stagger)
+    return TaskEnv(make_task(), seed=seed, ends=ends)
 
 
 def whole_batch(batch: TensorDictBase) -> TensorDictBase:

@@ -126,6 +126,20 @@ class EpisodeColumns:
         return values
 
 
+@dataclass(frozen=True)
+class EpisodeEnds:
+    """When episodes of a training end, apart from failing and the task's own limit.
+
+    Attributes:
+        stagger: end each first episode at a random step, so that resets spread over time. Statistics of such an episode
+            have `whole` = 0.
+        after_success: control steps after its first success at which an episode is truncated; None: never.
+    """
+
+    stagger: bool = False
+    after_success: int | None = None
+
+
 class TaskEnv(EnvBase):
     """Steps the bare task; TorchRL resets the ended rows, so ("next", "observation") is always the true one.
 
@@ -139,19 +153,19 @@ class TaskEnv(EnvBase):
     Args:
         task: the batch to step; closed with this environment.
         seed: seed of the first reset; later resets go on from it.
-        stagger: end each first episode at a random step, so that resets spread over time. Statistics of
-            such an episode have `whole` = 0.
+        ends: when episodes end early.
     """
 
-    def __init__(self, task: Task, *, seed: int | None = None, stagger: bool = False):
+    def __init__(self, task: Task, *, seed: int | None = None, ends: EpisodeEnds = EpisodeEnds()):
         super().__init__(device=task.device, batch_size=torch.Size([task.num_envs]))
-        self.task = task
+        self.task, self.ends = task, ends
         self._pending_seed: int | list[int] | None = seed
         self.columns = EpisodeColumns.of(tuple(dict.fromkeys((*task.logged, NONFINITE))))
         self._limit = torch.full((task.num_envs,), task.max_steps, device=task.device)
-        if stagger:
+        if ends.stagger:
             generator = torch.Generator().manual_seed(0 if seed is None else seed)
             self._limit[:] = torch.randint(1, task.max_steps + 1, self._limit.shape, generator=generator)
+        self._whole = self._limit == task.max_steps
         self._statistics = torch.zeros(task.num_envs, len(self.columns.names), device=task.device)
         self._last, self._highest, self._total = self._statistics.split(
             [len(self.columns.last), len(self.columns.highest), len(self.columns.total)], dim=1
@@ -213,7 +227,7 @@ class TaskEnv(EnvBase):
     def _restart_rows(self, rows: Bool[Tensor, " n"]) -> TensorDictBase:
         index = rows.nonzero()[:, 0]
         self._statistics[index] = 0.0
-        self._limit[index] = self.task.max_steps
+        self._limit[index], self._whole[index] = self.task.max_steps, True
         return self._first(self.task.reset(options={"env_idx": index})[0])
 
     def _first(self, observation: Tensor) -> TensorDictBase:
@@ -235,6 +249,8 @@ class TaskEnv(EnvBase):
         action = tensordict.get("action").clamp(self._low, self._high)
         observation, reward, _, _, info = self.task.step(action)
         fail = info.get("fail")
+        if self.ends.after_success is not None and "success" in info:
+            self._shorten(info["success"].to(torch.bool).reshape(-1), self.ends.after_success)
         truncated = self.task.elapsed_steps >= self._limit
         terminated = torch.zeros_like(truncated) if fail is None else fail.to(torch.bool).reshape(-1)
         bad = _bad_rows(observation, reward, info)
@@ -257,11 +273,16 @@ class TaskEnv(EnvBase):
             device=self.device,
         )
 
+    def _shorten(self, success: Bool[Tensor, " n"], after: int) -> None:
+        """Lets the episodes that have succeeded end some steps from now, unless they end before."""
+        end = torch.where(success, self.task.elapsed_steps + after, self._limit)
+        torch.minimum(self._limit, end, out=self._limit)
+
     def _count(self, reward: Float[Tensor, " n"], info: dict[str, Any]) -> None:
         """Bring the statistics of the running episodes up to date with one step."""
         one = torch.ones_like(self._limit, dtype=torch.float32)
         given: dict[str, Tensor] = info | {
-            "whole": (self._limit == self.task.max_steps).float(),
+            "whole": self._whole.float(),
             "return": reward,
             "length": one,
         }

@@ -26,7 +26,7 @@ from dora.agents.checkpoint import (
     whole,
 )
 from dora.agents.collecting.rollouts import Rollouts
-from dora.agents.collecting.task_env import NONFINITE, EpisodeColumns, MakeTask, ended_episodes
+from dora.agents.collecting.task_env import NONFINITE, EpisodeColumns, EpisodeEnds, MakeTask, ended_episodes
 from dora.agents.config import RunConfig
 from dora.agents.counters import LEARNER, Counters, checked_counters
 from dora.agents.evaluation.evaluate import PERIODIC_SEED, Evaluation, outcome
@@ -182,7 +182,7 @@ class Trainer:
             num_envs=config.num_envs,
             rollout=self.learner.rollout,
             seeds=seeds_for(config.seed, self.counters.env_steps + 1, max(config.workers, 1)),
-            stagger=config.stagger,
+            ends=EpisodeEnds(config.stagger, config.after_success),
             ahead=self.learner.replay is not None,
             check=interrupt.check,
             cluster=self._cluster,

@@ -33,8 +33,9 @@ class Guide:
 
     def target(self, s: Snapshot, action: Float[Tensor, "n a"], expand: Callable[[Tensor], Tensor]) -> Target:
         """Where the hand goes in the next control step; `expand` maps the action's hand part to all hand joints."""
-        target = self.residual.apply(self.reference.target(s), action.clamp(-1, 1), expand)
-        self.reference.aim(target)
+        reference = self.reference
+        target = self.residual.apply(reference.target(s), action.clamp(-1, 1), expand, reference.freedom())
+        reference.aim(target)
         return target
 
     def anneal(self, bounds: float | None = None, error: float | None = None) -> None:

@@ -58,6 +58,10 @@ class Reference(ABC):
     def advance(self, s: Snapshot) -> None:
         """Moves phases and ramps on, once per control step."""
 
+    def freedom(self) -> Float[Tensor, " n"] | float:
+        """Share of the residual action's bounds that is in force in the present phase."""
+        return 1.0
+
     def aim(self, target: Target) -> None:  # noqa: B027 (most references need not know)
         """Is told where wrist and hand are being sent: the target with the residual action."""
 

@@ -60,14 +60,25 @@ class ResidualAction:
         """No residual in the environments that start anew."""
         self.buffers.clear(rows)
 
-    def apply(self, target: Target, action: Float[Tensor, "n a"], expand: Callable[[Tensor], Tensor]) -> Target:
+    def apply(
+        self,
+        target: Target,
+        action: Float[Tensor, "n a"],
+        expand: Callable[[Tensor], Tensor],
+        freedom: Float[Tensor, " n"] | float = 1.0,
+    ) -> Target:
         """Takes in an action in [-1, 1] and adds the residual to the target; call once per control step.
 
-        `expand` maps the action's hand part to all hand joints.
+        Args:
+            target: of the reference.
+            action: a: 3 translation, 3 rotation vector, then the hand's part.
+            expand: maps the action's hand part to all hand joints.
+            freedom: share of the bounds that the reference leaves to the residual now.
         """
         residual = self.buffers.residual
         residual += SMOOTHING * (action - residual)
-        c, bounds = self.scale * residual, self.bounds
+        share = self.scale * torch.as_tensor(freedom, device=residual.device).reshape(-1, 1)
+        c, bounds = share * residual, self.bounds
         turn = quaternion_from_rotation_vector(bounds.rotation * c[:, 3:6])
         return Target(
             target.wrist_p + quaternion_apply(target.wrist_q, bounds.position * c[:, :3]),

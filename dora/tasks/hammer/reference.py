@@ -79,6 +79,9 @@ class CatchSettings:
     """Spin of the wrist between catch and blow [rad/s]."""
     arrived: tuple[float, float] = (0.01, 0.06)
     """Wrist error below which a place has been reached [m], [rad]."""
+    held_freedom: float = 1.0
+    """Share of the residual action's bounds that is in force once the hammer is held, for what follows is led by the
+    hammer's measured pose [1]."""
     patience: float = 1.5
     """Time after which a phase that waits for the wrist goes on all the same [s]."""
 
@@ -166,6 +169,10 @@ class CatchReference(Reference):
             grasped_p=0.0, spent=0.0, sinking=0.0, depth=0.0,
         )  # fmt: skip
         self.phase.reset(rows)
+
+    def freedom(self) -> Float[Tensor, " n"]:
+        """All of the residual while the hammer is caught, less from then on."""
+        return torch.where(self.phase.index <= SETTLE, 1.0, self.settings.held_freedom)
 
     def _arrival(self, s: HammerSnapshot) -> Tensor:
         """Time (n,) until the candidate comes down to the height at which the fingers are to hold it [s]."""
