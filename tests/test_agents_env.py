@@ -1,12 +1,13 @@
 """Task environment: TorchRL's contract, true last observations, statistics."""
 
+import pytest
 import torch
 from fake_task import PointMass
 from tensordict import TensorDict
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
-from dora.agents.collecting.task_env import EpisodeColumns, TaskEnv, ended_episodes
+from dora.agents.collecting.task_env import EpisodeColumns, EpisodeEnds, TaskEnv, ended_episodes
 
 
 def rollout(env: TaskEnv, steps: int) -> TensorDict:
@@ -21,7 +22,7 @@ def test_specs_hold():
 
 
 def test_the_true_last_observation_is_kept_and_only_ended_rows_restart():
-    env = TaskEnv(PointMass(4, max_steps=5), seed=0, stagger=True)
+    env = TaskEnv(PointMass(4, max_steps=5), seed=0, ends=EpisodeEnds(stagger=True))
     data = rollout(env, 12)
     done = data["next", "done"][..., 0]
     moved = (data["next", "observation"][..., :2] - data["observation"][..., :2]).abs()
@@ -34,7 +35,9 @@ def test_the_true_last_observation_is_kept_and_only_ended_rows_restart():
 
 
 def test_the_short_path_equals_torchrl_own():
-    ours, theirs = (TaskEnv(PointMass(4, max_steps=5, fail_at=4), seed=1, stagger=True) for _ in range(2))
+    ours, theirs = (
+        TaskEnv(PointMass(4, max_steps=5, fail_at=4), seed=1, ends=EpisodeEnds(stagger=True)) for _ in range(2)
+    )
     state, reference = ours.reset(), theirs.reset()
     for _ in range(15):
         action = torch.rand(4, 2) * 2 - 1
@@ -74,13 +77,37 @@ def test_statistics_are_those_of_the_episode():
 
 
 def test_staggered_first_episodes_are_spread_and_not_counted():
-    env = TaskEnv(PointMass(64, max_steps=16), seed=3, stagger=True)
+    env = TaskEnv(PointMass(64, max_steps=16), seed=3, ends=EpisodeEnds(stagger=True))
     data = rollout(env, 48)
     first = data["next", "done"][..., 0].float().argmax(1)
     assert len(first.unique()) > 8
     ended = ended_episodes(data["next", "done"], data["next", "statistics"], env.columns)
     assert (env.columns.column(ended, "length") == 16).all()
     assert len(ended) >= 64
+
+
+@pytest.mark.parametrize("after", [0, 2, 9])
+def test_an_episode_ends_some_steps_after_its_first_success(after: int):
+    task = PointMass(64, max_steps=12)
+    data = rollout(TaskEnv(task, seed=0, ends=EpisodeEnds(after_success=after)), 120)
+    columns = TaskEnv(task).columns
+    success = columns.column(data["next", "statistics"], "success") > 0
+    done, terminated = data["next", "done"][..., 0], data["next", "terminated"]
+    early = 0
+    for row in range(64):
+        first, length = None, 0
+        for t in range(120):
+            length += 1
+            first = t if first is None and success[row, t] else first
+            wanted = length == 12 or (first is not None and t == first + after)
+            assert bool(done[row, t]) == wanted
+            early += wanted and length < 12
+            if wanted:
+                first, length = None, 0
+    assert early > 10
+    assert not terminated.any()
+    ended = ended_episodes(data["next", "done"], data["next", "statistics"], columns)
+    assert len(ended) == int(done.sum())  # whole ones: they are counted
 
 
 def test_actions_are_clipped():

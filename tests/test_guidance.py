@@ -89,6 +89,9 @@ def test_corrections_are_low_passed_bounded_and_in_the_hand_frame():
     correction.set_scale(0.5)
     halved = correction.apply(target, action, lambda hand: hand)
     torch.testing.assert_close(halved.wrist_p, torch.tensor([[0.0, 0.01, 0.0]]), atol=1e-6, rtol=0)
+    left = correction.apply(target, action, lambda hand: hand, torch.tensor([0.4]))
+    torch.testing.assert_close(left.wrist_p, torch.tensor([[0.0, 0.004, 0.0]]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(left.hand, torch.full((1, 20), -0.04), atol=1e-6, rtol=0)
     with pytest.raises(InputError, match="between 0 and 1"):
         correction.set_scale(1.5)
 

@@ -16,7 +16,7 @@ from dora.geometry.rotations import (
 )
 from dora.tasks.hammer import mdp
 from dora.tasks.hammer.ballistics import Strike, after_fall, arrival, fall_time, slid
-from dora.tasks.hammer.reference import ALIGN, CatchReference
+from dora.tasks.hammer.reference import ALIGN, REST, CatchReference, CatchSettings
 from dora.tasks.hammer.snapshot import HAND_CENTRE, HammerSnapshot, face_to_nail, handle_distance, misalignment
 from dora.tasks.hammer.task import UNKNOWN, HammerConfig
 
@@ -194,6 +194,14 @@ def test_the_reference_brings_the_held_hammer_over_the_nail_wherever_it_is_held(
     assert misalignment(s).max() < 0.02
     assert face_to_nail(s)[:, :2].norm(dim=-1).max() < 0.005
     assert ((face_to_nail(s)[:, 2] < -0.03) & (face_to_nail(s)[:, 2] > -0.07)).all()
+
+
+def test_the_residual_has_its_bounds_until_the_hammer_is_held_and_a_share_of_them_from_then_on():
+    strike = Strike(torch.tensor(CONFIG.nail.top), torch.zeros(REST + 1, 3), CONFIG.swing_radius)
+    settings = CatchSettings(held_freedom=0.25)
+    reference = CatchReference(REST + 1, strike, CONFIG.nail.driven, 0.025, "cpu", settings)
+    reference.phase.index.copy_(torch.arange(REST + 1))
+    assert reference.freedom().tolist() == [1.0] * ALIGN + [0.25] * (REST + 1 - ALIGN)
 
 
 # ---------------------------------------------------------------------- solution
