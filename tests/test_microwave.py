@@ -1,13 +1,12 @@
-"""DoraMicrowave-v1: geometry, stages and references on invented states, and what the scripted solution does."""
+"""DoraMicrowave-v1: geometry and references on invented states, and what the scripted solution does."""
 
-import dataclasses
-from math import pi, radians
+from math import pi
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from invented import GOAL_SHAPES, HAND_SHAPES, OBJECT_SHAPES, SHARED_SHAPES, TIP_RADIUS, record
+from invented_microwave import YAW, in_world, invented, out, turned
 from torch import Tensor
 
 import dora.tasks as tasks
@@ -21,74 +20,15 @@ from dora.geometry.rotations import (
     rotation_angle,
 )
 from dora.robot import load_robot
-from dora.tasks.mdp.snapshot import GoalState, HandState, ObjectState
-from dora.tasks.microwave import mdp
 from dora.tasks.microwave.mdp import MicrowaveConfig
 from dora.tasks.microwave.reference import entry_turn, with_door
-from dora.tasks.microwave.snapshot import CAVITY, LEFT, RIGHT, MicrowaveSnapshot, cube_in_oven, hand_out, inside
+from dora.tasks.microwave.snapshot import CAVITY, LEFT, RIGHT, MicrowaveSnapshot, cube_in_oven, hands_out, inside
 from dora.tasks.microwave.task import MicrowaveTask, mirrored, oven_mount
 
 CONFIG = MicrowaveConfig()
 """The task's own numbers."""
-STAGES, TERMS = mdp.stages(CONFIG), mdp.terms(CONFIG).terms
-OVEN = (0.7, 0.05, 0.1)
-"""Where the invented microwave stands [m]."""
-YAW = 0.15
-"""How it is turned [rad]."""
 STARTS = 100
 """Episodes of the scripted solution [1]."""
-
-
-def turned(angle: float, n: int = 2) -> Tensor:
-    """Orientation (n, 4) after a turn about the vertical [rad]."""
-    return quaternion_from_rotation_vector(torch.tensor([[0.0, 0.0, angle]]).repeat(n, 1))
-
-
-def in_world(*local: float, n: int = 2) -> Tensor:
-    """A point of the microwave's frame in the world (n, 3) [m]."""
-    return torch.tensor(OVEN) + quaternion_apply(turned(YAW, n), torch.tensor([local]).repeat(n, 1))
-
-
-def invented(
-    left: dict[str, Any] | None = None,
-    right: dict[str, Any] | None = None,
-    handle: dict[str, Any] | None = None,
-    cube: dict[str, Any] | None = None,
-    goals: dict[str, dict[str, Any]] | None = None,
-    n: int = 2,
-    **given: Any,
-) -> MicrowaveSnapshot:
-    """A snapshot of zeros and unit quaternions with a shut microwave, and what is given of each record."""
-    tips = {"tip_radius": TIP_RADIUS}
-    half = {"half": torch.full((n, 3), 0.03)}
-    hands = {
-        LEFT: record(HandState, HAND_SHAPES, n, tips | (left or {})),
-        RIGHT: record(HandState, HAND_SHAPES, n, tips | (right or {})),
-    }
-    shut = torch.tensor(oven_mount().object_link.quaternion)
-    objects = {
-        "microwave": record(ObjectState, OBJECT_SHAPES, n, half | (handle or {})),
-        "cube": record(ObjectState, OBJECT_SHAPES, n, half | (cube or {})),
-    }
-    own = {
-        "oven_p": torch.tensor(OVEN).repeat(n, 1), "oven_q": turned(YAW, n), "door": torch.zeros(n),
-        "door_speed": torch.zeros(n), "wrists": torch.stack([hand.wrist_p for hand in hands.values()], 1),
-        "tips_of_placer": hands[RIGHT].tip_p, "cube_p": objects["cube"].p,
-        "bar": torch.tensor([[0.03, 0.0, -0.09], [0.03, 0.0, 0.09]]), "bar_radius": 0.008, "shut_q": shut,
-    }  # fmt: skip
-    records = {
-        "hands": hands,
-        "objects": objects,
-        "goals": {arm: record(GoalState, GOAL_SHAPES, n, (goals or {}).get(arm, {})) for arm in hands},
-        "handles": {LEFT: "microwave", RIGHT: "cube"},
-        "stages": {LEFT: torch.zeros(n, dtype=torch.long), RIGHT: torch.zeros(n, dtype=torch.long)},
-    }
-    return record(MicrowaveSnapshot, SHARED_SHAPES, n, records | own | given)
-
-
-def out(n: int = 2) -> dict[str, Tensor]:
-    """A right hand in front of the microwave."""
-    return {"wrist_p": in_world(-0.2, 0.0, 0.1, n=n), "tip_p": in_world(-0.05, 0.0, 0.1, n=n)[:, None].repeat(1, 5, 1)}
 
 
 # ---------------------------------------------------------------------- geometry
@@ -112,9 +52,9 @@ def test_a_cube_is_inside_when_all_of_it_is(place: tuple[float, ...], expected: 
 
 @pytest.mark.parametrize("part", ["wrist_p", "tip_p"])
 def test_a_hand_is_out_when_wrist_and_fingertips_are(part: str):
-    assert hand_out(invented(right=out())).all()
+    assert hands_out(invented(right=out())).all()
     late = out() | {part: (in_world(0.05, 0.0, 0.1) if part == "wrist_p" else out()["tip_p"] + 0.2)}
-    assert not hand_out(invented(right=late)).any()
+    assert not hands_out(invented(right=late)).any()
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, 1.4])
@@ -212,104 +152,6 @@ def test_mirrored_candidates_are_mirror_images():
     assert (image.robot, image.robot_digest) == ("diana7_hit_left", hand_digest(left))
 
 
-# ------------------------------------------------------------------------ stages
-
-
-def test_each_arm_has_stages_of_its_own():
-    assert [stage.name for stage in STAGES[LEFT]] == ["reach_handle", "grasp_handle", "open"]
-    assert [stage.name for stage in STAGES[RIGHT]] == ["reach_cube", "grasp_cube", "carry", "put_in", "leave"]
-
-
-def test_the_door_is_open_from_sixty_degrees():
-    s = invented(door=torch.tensor([radians(59.0), radians(61.0)])).of(LEFT)
-    assert STAGES[LEFT][2].done(s).tolist() == [False, True]
-
-
-@pytest.mark.parametrize("missing", ["nothing", "inside", "still", "untouched", "out"])
-def test_the_cube_is_put_down_when_it_lies_inside_alone(missing: str):
-    touch = torch.zeros(2, 6, dtype=torch.bool)
-    cube = {"p": in_world(0.12, 0.0, 0.05)}
-    right = out() | {"touch": touch}
-    if missing == "inside":
-        cube = {"p": in_world(-0.05, 0.0, 0.05)}
-    elif missing == "still":
-        cube |= {"v": torch.full((2, 3), 0.05)}
-    elif missing == "untouched":
-        right |= {"touch": ~touch}
-    elif missing == "out":
-        right |= {"wrist_p": in_world(0.05, 0.0, 0.1)}
-    s = invented(right=right, cube=cube)
-    assert STAGES[RIGHT][-1].done(s.of(RIGHT)).all() == (missing == "nothing")
-    paid = TERMS["placed"].value(invented(right=right, cube=cube, door=torch.tensor([0.5, 1.2])))
-    assert paid.tolist() == [0.0, float(missing == "nothing")]
-
-
-def test_an_overlap_above_the_limit_pays_no_end():
-    s = {"right": out(), "cube": {"p": in_world(0.12, 0.0, 0.05)}, "door": torch.full((2,), 1.2)}
-    paid = TERMS["placed"].value(invented(**s, max_penetration=torch.tensor([0.004, 0.006])))
-    assert paid.tolist() == [1.0, 0.0]
-
-
-def test_without_the_overlap_term_the_reward_does_not_depend_on_overlap():
-    """`--task.weights.penetration 0 --task.after-overlap 1 --task.placed-after-overlap 1`."""
-    weights = dataclasses.replace(CONFIG.weights, penetration=0.0)
-    free = mdp.terms(dataclasses.replace(CONFIG, after_overlap=1.0, placed_after_overlap=1.0, weights=weights)).terms
-    for stage, x in ((2, -0.1), (3, -0.1), (5, 0.12)):
-        stages = {LEFT: torch.full((2,), 3), RIGHT: torch.full((2,), stage)}
-        depth = torch.tensor([0.0, 0.006])
-        s = invented(
-            right=out(), cube={"p": in_world(x, 0.0, 0.05)}, door=torch.full((2,), 1.2), stages=stages,
-            penetration=depth, max_penetration=depth,
-        )  # fmt: skip
-        for name, term in free.items():
-            paid = term.weight * term.value(s)
-            assert paid[0] == paid[1], name
-    assert free["placed"].value(s).tolist() == [1.0, 1.0]
-
-
-BETTER: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "open": ({"door": torch.tensor([0.1, 0.6])}, {LEFT: 2}),
-    "put": ({"cube": {"p": torch.stack([in_world(-0.1, 0.0, 0.1)[0], in_world(0.05, 0.0, 0.1)[0]])}}, {RIGHT: 3}),
-    "carry": ({"cube": {"p": torch.stack([in_world(-0.4, -0.4, 0.0)[0], in_world(-0.2, 0.0, 0.085)[0]])}}, {RIGHT: 2}),
-}
-"""Two states of which the second is better, and the stages in which a term pays."""
-
-
-@pytest.mark.parametrize("name", BETTER)
-def test_terms_grow_with_what_they_are_there_for_in_their_stage(name: str):
-    state, stage = BETTER[name]
-    stages = {arm: torch.full((2,), stage.get(arm, 0)) for arm in (LEFT, RIGHT)}
-    worse, better = TERMS[name].value(invented(**state, stages=stages)).tolist()
-    assert worse < better <= 1
-    assert TERMS[name].value(invented(**state)).tolist() == [0.0, 0.0]  # nothing before its stage
-
-
-@pytest.mark.parametrize("name", ["carry", "put"])
-def test_after_an_overlap_above_the_limit_the_cube_earns_less(name: str):
-    stage = {RIGHT: 2 if name == "carry" else 3}
-    stages = {arm: torch.full((2,), stage.get(arm, 0)) for arm in (LEFT, RIGHT)}
-    cube = {"p": in_world(-0.1, 0.0, 0.1)}
-    clean, deep = (
-        TERMS[name].value(invented(cube=cube, stages=stages, max_penetration=torch.tensor([0.004, 0.006]))).tolist()
-    )
-    assert deep == pytest.approx(CONFIG.after_overlap * clean)
-    assert clean > 0
-
-
-def test_no_term_leaves_its_bounds():
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(20):
-        spread = {"p": torch.randn(8, 3, generator=generator)}
-        s = invented(
-            n=8, cube=spread, handle=spread, door=2 * torch.rand(8, generator=generator),
-            stages={arm: torch.randint(0, 6, (8,), generator=generator) for arm in (LEFT, RIGHT)},
-            action=2 * torch.rand(8, 26, generator=generator) - 1,
-        )  # fmt: skip
-        for name, term in TERMS.items():
-            value = term.value(s)
-            assert ((value >= 0) & (value <= 1)).all(), name
-
-
 # -------------------------------------------------------------------- simulation
 
 
@@ -370,7 +212,7 @@ def test_stages_of_the_arms_go_on_side_by_side(task: Any):
         left, right = (index for index in task.machine.by_arm().values())
         together |= bool(((left > 0) & (left < 3) & (right > 0)).any())
     assert together
-    assert task.stage_names == tuple(stage.name for arm in (LEFT, RIGHT) for stage in STAGES[arm])
+    assert task.stage_names == tuple(stage.name for arm in (LEFT, RIGHT) for stage in mdp.stages(CONFIG)[arm])
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ The hammer's blow starts the nail at nearly the hammer's speed and is then spent
 moves it too, and a nail pushed in has not been hammered: a blow is an impact above `blow_speed` of the striking face on
 the nail's head. What the nail sinks within `blow_window` after one counts as driven while nothing but that face presses
 on the nail, and only as long as the nail is no faster than the momentum of hammer and hand by itself would drive it
-(`slowed`): once it is pushed on after a touch, the blow is over.
+(`slowed`): once it is pushed on after a touch, the blow is over. A hammer that no hand holds strikes no blow.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import sapien
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Articulation, Link
 from sapien.physx import PhysxMaterial
@@ -49,7 +49,7 @@ FACE_DEPTH, FACE_EDGE = 0.006, 0.003
 point of a contact lies between the two surfaces, which a blow presses into each other."""
 UPRIGHT = 0.7
 """Smallest vertical share of a contact's normal that presses the nail down, not aside [1]."""
-STATE = ("_depth", "_driven", "_since", "_speed", "_before", "_sinking", "_free")
+STATE = ("_depth", "_driven", "_since", "_speed", "_before", "_sinking", "_free", "_held")
 """Buffers of a nail that its state holds."""
 DOWN = (0.7071068, 0.0, 0.7071068, 0.0)
 """Turns +x, the axis of joints and cylinders, into -z (wxyz): the joint's coordinate is the nail's depth."""
@@ -132,6 +132,7 @@ class Nail:
         self._before = np.zeros(n, np.float32)
         self._sinking = np.zeros(n, np.float32)
         self._free = np.zeros(n, np.float32)
+        self._held = np.zeros(n, np.float32)
         self._hammers: list[sapien.physx.PhysxRigidDynamicComponent] = []
         self._faces: Float[np.ndarray, "n 3"] = np.zeros((n, 3))
         self._radii: Float[np.ndarray, " n"] = np.zeros(n)
@@ -155,7 +156,7 @@ class Nail:
         self.articulation.set_qpos(torch.zeros(len(rows), 1, device=self._device))
         self.articulation.set_qvel(torch.zeros(len(rows), 1, device=self._device))
         index = rows.cpu().numpy()
-        for buffer in (self._depth, self._driven, self._speed, self._before, self._sinking, self._free):
+        for buffer in (self._depth, self._driven, self._speed, self._before, self._sinking, self._free, self._held):
             buffer[index] = 0.0
         self._since[index] = self.settings.blow_window
         self._hold(index.tolist())
@@ -188,7 +189,7 @@ class Nail:
         if depth > before + MOVED:
             face, other = self._pressed(i, contacts)
             speed = float(max(self._speed[i], self._before[i]))  # PhysX slows a face down in the step before it touches
-            blow = face and speed > self.settings.blow_speed
+            blow = face and bool(self._held[i]) and speed > self.settings.blow_speed
             if blow:
                 self._strike(i, speed, float(self._sinking[i]) if speed == self._speed[i] else 0.0)
             if self._since[i] < self.settings.blow_window and not other and body.qvel[0] <= self._free[i]:
@@ -249,6 +250,10 @@ class Nail:
         spin = hammer.angular_velocity
         down = -(hammer.linear_velocity[2] + spin[0] * arm[1] - spin[1] * arm[0])
         return float(down) - nail_speed
+
+    def let_strike(self, held: Bool[Tensor, " n"]) -> None:
+        """Whether each hammer is held to strike: what one that is not does to the nail is no blow."""
+        self._held[:] = held.cpu().numpy()
 
     @property
     def depth(self) -> Float[Tensor, " n"]:

@@ -28,7 +28,7 @@ from dora.tasks.env.starts import ChosenStarts, StartNumber
 from dora.tasks.env.task import HAND_CAMERA, Task
 from dora.tasks.guidance.reference import Reference
 from dora.tasks.hammer.ballistics import Strike
-from dora.tasks.hammer.mdp import failed, paper_terms, stages, terms
+from dora.tasks.hammer.mdp import STRIKE, failed, in_hand, paper_terms, stages, terms
 from dora.tasks.hammer.nail import Nail, NailSettings, drawn_links
 from dora.tasks.hammer.reach import with_waiting_hand, within_reach
 from dora.tasks.hammer.reference import CatchReference, CatchSettings
@@ -294,7 +294,9 @@ class HammerTask(Task):
         return (p - old_p).norm(dim=-1), torch.where(known, drift_r, UNKNOWN)
 
     def remember(self, s: Snapshot) -> None:
-        """Notes the pose of the hammer in the hand in the present control step."""
+        """Notes the pose of the hammer in the hand in the present control step, and whether it is held to strike."""
+        assert isinstance(s, HammerSnapshot)
+        self.nail.let_strike((s.stage >= STRIKE) & in_hand(s, self.config))
         history = self.history.history
         rows, now = torch.arange(len(history), device=history.device), self._step(s) % history.shape[1]
         history[rows, now] = torch.cat(relative((s.hand.wrist_p, s.hand.wrist_q), (s.object.p, s.object.q)), -1)

@@ -29,11 +29,12 @@ from dora.tasks.mdp.terms import (
 )
 from dora.tasks.microwave.reference import OpenSettings, PlaceSettings
 from dora.tasks.microwave.snapshot import (
+    CAVITY,
     LEFT,
     RIGHT,
     MicrowaveSnapshot,
     cube_in_oven,
-    hand_out,
+    hands_out,
     inside,
     into_oven_in_hand,
     object_in_oven,
@@ -153,14 +154,15 @@ Value = Callable[[Any], Tensor]
 def before_cavity(s: MicrowaveSnapshot, c: MicrowaveConfig) -> Bool[Tensor, " n"]:
     """The lifted cube is in front of the cavity."""
     p = cube_in_oven(s)
-    return (p[:, 0] > -c.front) & (p[:, 1].abs() < c.front / 2) & (lifted(s) > c.lift)
+    ahead = (p[:, 0] > -c.front) & (p[:, 0] < 0) & (p[:, 2] < CAVITY[2][1])
+    return ahead & (p[:, 1].abs() < c.front / 2) & (lifted(s) > c.lift)
 
 
 @derived
 def at_rest(s: MicrowaveSnapshot, c: MicrowaveConfig) -> Bool[Tensor, " n"]:
-    """The cube lies inside, nobody touches it, and the hand is out."""
+    """The cube lies inside, the hand does not touch it, the hands are out, and the door is open."""
     still = s.object.v.norm(dim=-1) < c.rest_speed
-    return inside(s) & still & ~s.hand.touch.any(-1) & hand_out(s)
+    return inside(s) & still & ~s.hand.touch.any(-1) & hands_out(s) & (s.door >= c.open)
 
 
 def _depth(s: MicrowaveSnapshot, c: MicrowaveConfig) -> Tensor:
@@ -193,19 +195,25 @@ def stages(c: MicrowaveConfig) -> dict[str, list[Stage[MicrowaveSnapshot]]]:
     def touching(s: MicrowaveSnapshot) -> Tensor:
         return (s.hand.touch[:, 0].float() + s.hand.touch[:, 1:-1].any(-1)) / 2
 
+    def opened(s: MicrowaveSnapshot) -> Tensor:
+        return s.door >= c.open
+
+    def slipped(s: MicrowaveSnapshot) -> Tensor:
+        return lost(s) | (opened(s) & ~s.hand.touch[:, :-1].any(-1))
+
     hold = c.touch_time
     return {
         LEFT: [
             Stage("reach_handle", near, reached),
             Stage("grasp_handle", touching, opposed, hold=hold, lost=lost, back_to="reach_handle"),
-            Stage("open", lambda s: (s.door / c.open).clamp(0, 1), lambda s: s.door >= c.open),
+            Stage("open", lambda s: (s.door / c.open).clamp(0, 1), opened, lost=slipped, back_to="reach_handle"),
         ],
         RIGHT: [
             Stage("reach_cube", near, reached),
             Stage("grasp_cube", touching, opposed, hold=hold, lost=lost, back_to="reach_cube"),
             Stage("carry", lambda s: _before(s, c), lambda s: before_cavity(s, c), lost=lost, back_to="reach_cube"),
             Stage("put_in", lambda s: _depth(s, c), inside, lost=dropped, back_to="reach_cube"),
-            Stage("leave", lambda s: hand_out(s).float(), lambda s: at_rest(s, c), hold=c.rest_time),
+            Stage("leave", lambda s: hands_out(s).float(), lambda s: at_rest(s, c), hold=c.rest_time),
         ],
     }
 
@@ -235,7 +243,7 @@ def terms(c: MicrowaveConfig) -> Terms[MicrowaveSnapshot]:
         return torch.where(inside(s), 1.0, 0.8 * _depth(s, c)) * (s.stage >= PUT) * clean(s)
 
     def placed(s: MicrowaveSnapshot) -> Tensor:
-        return (at_rest(s.of(RIGHT), c) & (s.door >= c.open)).float() * clean(s, c.placed_after_overlap)
+        return at_rest(s.of(RIGHT), c).float() * clean(s, c.placed_after_overlap)
 
     return Terms(
         {

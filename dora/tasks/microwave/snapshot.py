@@ -94,9 +94,9 @@ def inside(s: MicrowaveSnapshot) -> Bool[Tensor, " n"]:
 
 
 @derived
-def hand_out(s: MicrowaveSnapshot) -> Bool[Tensor, " n"]:
-    """The wrist and all fingertips of the right hand are in front of the front plane; other links are not tested."""
-    points = torch.cat([s.tips_of_placer, s.wrists[:, -1:]], 1)
+def hands_out(s: MicrowaveSnapshot) -> Bool[Tensor, " n"]:
+    """Both wrists and all fingertips of the right hand are in front of the front plane; other links are not tested."""
+    points = torch.cat([s.tips_of_placer, s.wrists], 1)
     q = quaternion_inverse(s.oven_q)[:, None].expand(-1, points.shape[1], -1)
     return quaternion_apply(q, points - s.oven_p[:, None])[..., 0].amax(-1) < 0.0
 
