@@ -20,6 +20,7 @@ from dora.geometry.rotations import (
     rotation_angle,
 )
 from dora.robot import load_robot
+from dora.tasks.microwave import mdp
 from dora.tasks.microwave.mdp import MicrowaveConfig
 from dora.tasks.microwave.reference import entry_turn, with_door
 from dora.tasks.microwave.snapshot import CAVITY, LEFT, RIGHT, MicrowaveSnapshot, cube_in_oven, hands_out, inside

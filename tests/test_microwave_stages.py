@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from invented_microwave import in_world, invented, out
 
 from dora.tasks.mdp.stages import StageMachine
 from dora.tasks.microwave import mdp
@@ -15,9 +16,6 @@ from dora.tasks.microwave.snapshot import LEFT, RIGHT
 CONFIG = MicrowaveConfig()
 """The task's own numbers."""
 STAGES, TERMS = mdp.stages(CONFIG), mdp.terms(CONFIG).terms
-
-
-# ------------------------------------------------------------------------ stages
 
 
 def test_each_arm_has_stages_of_its_own():

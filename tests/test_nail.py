@@ -1,5 +1,6 @@
 """The nail of DoraHammer-v1: what a blow of the striking face drives, and that pushes and other bodies do not."""
 
+import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import pi
@@ -20,6 +21,7 @@ from dora.geometry.rotations import (
 from dora.sim.substeps import watch_physics
 from dora.tasks.hammer.ballistics import Strike
 from dora.tasks.hammer.nail import slowed, struck
+from dora.tasks.hammer.snapshot import HAND_CENTRE
 from dora.tasks.hammer.task import HammerConfig, HammerTask
 
 CONFIG = HammerConfig()
@@ -28,10 +30,12 @@ CONFIG = HammerConfig()
 
 @pytest.fixture(scope="module")
 def bench() -> Iterator[tasks.DoraEnv]:
-    """One environment whose hammer the tests drop on the nail by hand."""
+    """One environment whose hammer the tests drop on the nail, where it counts as held."""
     task = tasks.make_task("DoraHammer-v1", 1, preset="none", sim_backend="physx_cpu", guidance="none")
-    assert isinstance(task.task, HammerTask)
-    yield task
+    hammer: HammerTask = task.task  # pyright: ignore[reportAssignmentType]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hammer, "remember", lambda _: hammer.nail.let_strike(torch.tensor([True])))
+        yield task
     task.close()
 
 
@@ -110,6 +114,25 @@ def test_blows_of_a_free_hammer_count_whole(bench: tasks.DoraEnv):
         depth, driven = run(bench, 4)
         assert driven == pytest.approx(depth, abs=0.05)
         assert driven > 0.5
+
+
+@pytest.mark.parametrize(("touching", "stage", "counts"), [(2, 3, True), (1, 3, False), (2, 2, False)])
+def test_a_hammer_that_is_not_held_to_strike_strikes_no_blow(
+    bench: tasks.DoraEnv, touching: int, stage: int, counts: bool
+):
+    """Two fingers have to be on the handle, in the stage of the blows."""
+    s = bench.snapshot
+    touch = torch.zeros_like(s.hand.touch)
+    touch[:, 1 : 1 + touching] = True
+    place = {"wrist_p": s.object.p - torch.tensor(HAND_CENTRE), "wrist_q": torch.tensor([[1.0, 0.0, 0.0, 0.0]])}
+    hands = {arm: dataclasses.replace(hand, touch=touch, **place) for arm, hand in s.hands.items()}
+    seen = dataclasses.replace(s, hands=hands, stage=torch.full_like(s.stage, stage))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench.task, "remember", lambda _: HammerTask.remember(bench.task, seen))
+        over_nail(bench, 0.01, 1.6)
+        depth, driven = run(bench, 4)
+    assert depth > 2
+    assert driven == pytest.approx(depth if counts else 0.0, abs=0.05)
 
 
 def test_a_nail_that_nothing_pushes_is_slowed_as_its_equation_says():
