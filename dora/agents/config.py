@@ -128,7 +128,7 @@ class SACConfig:
     """Widths of the hidden layers of actor and critics."""
 
 
-NEUTRAL = {"arm_effort": 1.0, "pose_filter": 1.0, "placed_after_overlap": 0.0}
+NEUTRAL = {"definition": 1, "arm_effort": 1.0, "pose_filter": 1.0, "placed_after_overlap": 0.0}
 """Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
 UNUSED = {"reward": "dense", "after_success": None}
 """The same of settings of the run."""

@@ -7,7 +7,7 @@ from statistics import mean
 import numpy as np
 from jaxtyping import Float
 
-from dora.agents.reports.paper import DIFFERENCES, JUG_GAIN, MEAN_GAIN, ONE_ARM, PAPER, Cell
+from dora.agents.reports.paper import BETTER, DIFFERENCES, JUG_GAIN, MEAN_GAIN, ONE_ARM, PAPER, Cell
 from dora.agents.reports.run_results import (
     DEFAULT_PRESET,
     SHARED,
@@ -31,6 +31,8 @@ NORMAL = 1.96
 """Half width of a normal distribution's 95 % interval, in standard deviations [1]."""
 FEWEST = 3
 """Seeds of every cell that a verdict on a claim needs [1]."""
+EXACT = 1e-9
+"""Standard error below which a rate counts as exact [points]."""
 SECONDS = 60.0
 """Seconds of a minute [s]."""
 
@@ -63,20 +65,30 @@ def sections(runs: Sequence[Run]) -> list[Section]:
 
 def of_the_paper(runs: Sequence[Run]) -> dict[Cell, list[Run]]:
     """The runs of each cell of the paper's tables: preset `standard`, the task's own reward, trained. Of several
-    budgets the largest that a task's runs have, so that all its cells have the same; of several variants of a task's
-    numbers that with most runs, the first of equals."""
+    budgets the largest with which the task was run with guidance, so that all its cells have the same; of several
+    variants of a task's numbers that with most runs, the first of equals."""
     groups = {
         (env, agent, guidance.partition(",")[0], thousands, guidance): members
         for (env, preset, agent, guidance, thousands), members in grouped(runs).items()
         if preset == DEFAULT_PRESET and (env, agent, guidance.partition(",")[0]) in PAPER
     }
-    largest = {env: max(steps for name, _, _, steps, _ in groups if name == env) for env, *_ in groups}
+    budget = {env: _budget([group for group in groups if group[0] == env]) for env, *_ in groups}
     found: dict[Cell, list[Run]] = {}
     for (env, agent, guidance, thousands, _), members in groups.items():
         cell = env, agent, guidance
-        if thousands == largest[env] and len(members) > len(found.get(cell, [])):
+        if thousands == budget[env] and len(members) > len(found.get(cell, [])):
             found[cell] = members
     return found
+
+
+def _budget(groups: Sequence[tuple[str, str, str, int, str]]) -> int:
+    """The budget of a task in the tables [thousand steps].
+
+    Args:
+        groups: task, learner, guidance, budget and variant of its runs.
+    """
+    guided = [thousands for _, _, guidance, thousands, _ in groups if guidance == "affordance"]
+    return max(guided or [thousands for *_, thousands, _ in groups])
 
 
 def variant(runs: Sequence[Run]) -> str:
@@ -192,11 +204,23 @@ def _steps(runs: Sequence[Run]) -> str:
     return f"{mean(reached) / 1000:.0f}k ({len(reached)} of {len(known)})" if reached else f"never (0 of {len(known)})"
 
 
+def _learners(env: str) -> list[Cell]:
+    """The cells of the two learners of a task with guidance."""
+    return [(env, agent, "affordance") for agent in ("PPO", "SAC")]
+
+
+def _ahead(env: str, rates: Mapping[Cell, float]) -> float:
+    """By how much the learner that is better on a task in the paper is ahead here [points]."""
+    ppo, sac = (rates.get(cell, 0.0) for cell in _learners(env))
+    return ppo - sac if BETTER[env] == "PPO" else sac - ppo
+
+
 def _claims(cells: Mapping[Cell, list[Run]]) -> Section:
     rates = {cell: _rate(runs) for cell, runs in cells.items()}
 
-    def row(claim: str, paper: str, needed: Sequence[Cell], ours: str, margin: float, error: float = 0.0) -> list[str]:
-        """A claim that holds if `margin` is above zero, by more than its standard error times 1.96."""
+    def row(claim: str, paper: str, needed: Sequence[Cell], ours: str, margin: float, error: float) -> list[str]:
+        """A claim that holds if `margin` is above zero, by more than its standard error times 1.96; undecided where
+        the error is not known."""
         missing = [
             f"{env} {agent} {guidance}" for env, agent, guidance in needed if (env, agent, guidance) not in cells
         ]
@@ -205,7 +229,7 @@ def _claims(cells: Mapping[Cell, list[Run]]) -> Section:
         fewest = min(len({run.result.get("seed") for run in cells[cell]}) for cell in needed)
         if fewest < FEWEST:
             return [claim, paper, ours, f"too few runs: {fewest} of {FEWEST} seeds"]
-        sure = abs(margin) > NORMAL * error if np.isfinite(error) else True
+        sure = np.isfinite(error) and abs(margin) > NORMAL * error
         return [claim, paper, ours, ("reproduced" if margin >= 0 else "not reproduced") if sure else "undecided"]
 
     errors = {cell: _error(runs) for cell, runs in cells.items()}
@@ -219,19 +243,18 @@ def _claims(cells: Mapping[Cell, list[Run]]) -> Section:
     gains = [rates.get(cell, 0.0) - rates.get((*cell[:2], "none"), 0.0) for cell in guided]
     jug = ("DoraJug-v1", "PPO", "affordance"), ("DoraJug-v1", "PPO", "none")
     jug_gain = rates.get(jug[0], 0.0) - rates.get(jug[1], 0.0)
-    best = {}
-    for env in ONE_ARM:
-        ppo, sac = (rates.get((env, agent, "affordance"), 0.0) for agent in ("PPO", "SAC"))
-        best[env] = "neither" if ppo == sac else "PPO" if ppo > sac else "SAC"
-    wanted = {"DoraCube-v1": "PPO", "DoraJug-v1": "PPO", "DoraHammer-v1": "SAC"}
-    mean_gain, learners = mean(gains), ", ".join(f"{env}: {agent}" for env, agent in best.items())
+    ahead = {env: _ahead(env, rates) for env in BETTER}
+    errors_ahead = {env: max(spread(_learners(env)), EXACT) for env in BETTER}
+    weakest = min(ahead, key=lambda env: ahead[env] / errors_ahead[env])
+    mean_gain, learners = mean(gains), ", ".join(f"{env}: {BETTER[env]} {d:+.1f}" for env, d in ahead.items())
     average = "affordance gains on average over tasks 1 to 3 and both learners"
     rows = [
         row(average, f"{MEAN_GAIN:+.1f}", one_arm, f"{mean_gain:+.1f}", mean_gain - MEAN_GAIN,
             spread(one_arm) / len(guided)),
         row("affordance gains on the jug with PPO", f"{JUG_GAIN:+.1f}", jug, f"{jug_gain:+.1f}", jug_gain - JUG_GAIN,
             spread(jug)),
-        row("PPO is better on cube and jug, SAC on the hammer", "yes", guided, learners, 2.0 * (best == wanted) - 1),
+        row("PPO is better on cube and jug, SAC on the hammer", "yes", guided, learners, ahead[weakest],
+            errors_ahead[weakest]),
     ]  # fmt: skip
     for env in dict.fromkeys(env for env, *_ in PAPER):
         both = [cell for cell in PAPER if cell[0] == env and cell[2] == "affordance"]

@@ -4,11 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from math import pi
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import sapien
 import torch
+import tyro
 from jaxtyping import Bool, Float, Int
 from mani_skill.utils.structs import Actor, Link, Pose
 from torch import Tensor
@@ -78,6 +79,8 @@ class HammerWeights(PenaltyWeights):
 class HammerConfig(TaskConfig):
     """Numbers of the task."""
 
+    definition: Annotated[int, tyro.conf.Suppress] = 2
+    """2: a blow ends when the nail is pushed on, and a hammer that is not held strikes none (November 2026)."""
     control_frequency: int = 40
     """Control steps per second [Hz]."""
     physics_frequency: int = 240

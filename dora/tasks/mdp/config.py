@@ -2,7 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
+
+import tyro
 
 from dora.tasks.mdp.randomisation import PRESETS, Randomisation
 
@@ -28,6 +30,8 @@ class TaskConfig:
     BY_PRESET: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     """Other numbers of the task that go with a preset, by the name of the preset."""
 
+    definition: Annotated[int, tyro.conf.Suppress] = 1
+    """Version of the task's rules, raised when results of before do not count any more; changes nothing by itself."""
     control_frequency: int = 20
     """Control steps per second [Hz]."""
     physics_frequency: int = 100
