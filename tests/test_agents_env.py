@@ -1,5 +1,7 @@
 """Task environment: TorchRL's contract, true last observations, statistics."""
 
+from typing import Any
+
 import pytest
 import torch
 from fake_task import PointMass
@@ -8,6 +10,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from dora.agents.collecting.task_env import EpisodeColumns, EpisodeEnds, TaskEnv, ended_episodes
+from dora.agents.seeds import TRAINING_SEEDS
 
 
 def rollout(env: TaskEnv, steps: int) -> TensorDict:
@@ -124,3 +127,18 @@ def test_penetration_counts_as_the_deepest_and_success_as_the_last():
     assert columns.last == ("success", "whole", "success_any_penetration")
     assert columns.highest == ("penetration_mm",)
     assert columns.total == ("return", "length", "reward/x")
+
+
+def test_the_rows_of_a_training_have_seeds_that_no_evaluation_has():
+    given: list[Any] = []
+
+    class Recording(PointMass):
+        def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[torch.Tensor, dict[str, Any]]:
+            given.append(seed)
+            return super().reset(seed, options)
+
+    TaskEnv(Recording(64), seed=7).reset()
+    first, again = given
+    assert first == again
+    assert len(set(first)) == 64
+    assert all(0 <= seed < TRAINING_SEEDS for seed in first)

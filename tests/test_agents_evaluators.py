@@ -18,7 +18,7 @@ from dora.agents.config import PPOConfig, RunConfig
 from dora.agents.evaluation.evaluate import FINAL_SEED, MOST_SEEDS, PERIODIC_SEED, STARTS, first_seed
 from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.learner import make_learner
-from dora.agents.runs.trainer import TRAINING_SEEDS
+from dora.agents.seeds import TRAINING_SEEDS
 from dora.errors import InputError
 
 EPISODES = 30

@@ -12,6 +12,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from dora.agents.agent_columns import AgentColumns, checked_agents
+from dora.agents.seeds import seeds_for
 
 
 @runtime_checkable
@@ -152,14 +153,15 @@ class TaskEnv(EnvBase):
 
     Args:
         task: the batch to step; closed with this environment.
-        seed: seed of the first reset; later resets go on from it.
+        seed: gives the rows their seeds in the first reset; later resets go on from there. ManiSkill itself would draw
+            them, but for the first row's, from all numbers below 2^31, those of evaluation among them.
         ends: when episodes end early.
     """
 
     def __init__(self, task: Task, *, seed: int | None = None, ends: EpisodeEnds = EpisodeEnds()):
         super().__init__(device=task.device, batch_size=torch.Size([task.num_envs]))
         self.task, self.ends = task, ends
-        self._pending_seed: int | list[int] | None = seed
+        self._pending_seed: list[int] | None = None
         self.columns = EpisodeColumns.of(tuple(dict.fromkeys((*task.logged, NONFINITE))))
         self._limit = torch.full((task.num_envs,), task.max_steps, device=task.device)
         if ends.stagger:
@@ -173,7 +175,8 @@ class TaskEnv(EnvBase):
         self._not_success = torch.tensor([float(name == "whole") for name in self.columns.last], device=task.device)
         self._low = torch.as_tensor(task.single_action_space.low, device=task.device)
         self._high = torch.as_tensor(task.single_action_space.high, device=task.device)
-        self._set_specs(task.reset(seed=seed)[0])
+        self._set_seed(seed)
+        self._set_specs(task.reset(seed=self._pending_seed)[0])
 
     def _set_specs(self, observation: Tensor) -> None:
         n, device = self.batch_size[0], self.device
@@ -294,7 +297,7 @@ class TaskEnv(EnvBase):
         self._total.add_(total)
 
     def _set_seed(self, seed: int | None) -> None:
-        self._pending_seed = seed
+        self._pending_seed = None if seed is None else seeds_for(seed, 0, self.task.num_envs)
 
     @property
     def start_numbers(self) -> dict[str, Float[Tensor, " n"]]:

@@ -6,7 +6,6 @@ import signal
 import time
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from tensordict import TensorDictBase
@@ -38,11 +37,10 @@ from dora.agents.runs.logging import RunLog
 from dora.agents.runs.machine import OtherLoad
 from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.run_folder import RunFolder, make_result
+from dora.agents.seeds import seeds_for
 from dora.errors import RECORDS, InputError, WorkerFailure
 from dora.progress import ProgressDisplay
 
-TRAINING_SEEDS = 1_000_000_000
-"""Seeds of training are below this number, those of evaluation are not."""
 RENAMED = {
     "success": "success_rate",
     "raw_success": "raw_success_rate",
@@ -53,12 +51,6 @@ RENAMED = {
 """Names of the means of the columns of episodes."""
 RECENT = 200
 """Number of latest training episodes over which the displayed success rate is taken."""
-
-
-def seeds_for(seed: int, step: int, count: int) -> list[int]:
-    """`count` independent seeds in [0, 1e9), different for every (seed, step)."""
-    state = np.random.SeedSequence([seed, step]).generate_state(count, np.uint64)
-    return [int(s % TRAINING_SEEDS) for s in state]
 
 
 class Trainer:
