@@ -75,11 +75,11 @@ class CatchSettings:
     """From impact to the next raising [s]."""
     carry_speed: float = 0.5
     """Speed of the wrist between catch and blow [m/s]."""
-    carry_spin: float = 2.0
+    carry_spin: float = 3.0
     """Spin of the wrist between catch and blow [rad/s]."""
     arrived: tuple[float, float] = (0.01, 0.06)
     """Wrist error below which a place has been reached [m], [rad]."""
-    held_freedom: float = 1.0
+    held_freedom: float = 0.2
     """Share of the residual action's bounds that is in force once the hammer is held, for what follows is led by the
     hammer's measured pose [1]."""
     patience: float = 1.5
