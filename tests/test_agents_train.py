@@ -256,6 +256,7 @@ def session_empties(session: int, within: float = 10.0) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_kill_then_resume_then_ctrl_c(tmp_path: Path):
     folder = RunFolder(tmp_path / "run")
     process = start(tmp_path, "new", 10**9)
