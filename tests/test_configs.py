@@ -168,6 +168,17 @@ def test_thresholds_weights_and_rates_are_in_force():
         env.close()
 
 
+def test_the_rates_of_a_sim_config_are_those_of_the_task():
+    """Holds, noise and the nail count in control and physics steps of this length."""
+    rates = {"sim_freq": 120, "control_freq": 60, "scene_config": {"bounce_threshold": 1.0}}
+    task = make_task("DoraCube-v1", 1, guidance="none", sim_config=rates)
+    assert (task.config.physics_frequency, task.config.control_frequency) == (task.sim_freq, task.control_freq)
+    assert task.control_freq == 60
+    task.close()
+    with pytest.raises(InputError, match="multiple of"):
+        make_task("DoraCube-v1", 1, guidance="none", sim_config={"sim_freq": 110, "control_freq": 60})
+
+
 def test_printing_an_environment_shows_the_tables_in_force(capsys: pytest.CaptureFixture[str]):
     assert describe.main(["DoraJug-v1", "--preset", "hard", "--task.lift", "0.12", "--task.weights.lift", "2.5"]) == 0
     shown = " ".join(capsys.readouterr().out.split())

@@ -93,20 +93,21 @@ def measure_physics(
 
 
 def _executed(env_id: str, physics: Physics, starts: int, preset: str, seed: int) -> PhysicsRow:
-    scene = {
+    config = {
+        "physics_frequency": int(physics.rate),
         "contact_offset": physics.contact_offset,
-        "solver_position_iterations": physics.position_iterations,
-        "solver_velocity_iterations": physics.velocity_iterations,
+        "solver_iterations": physics.position_iterations,
     }
-    config = {"sim_freq": int(physics.rate), "scene_config": scene}
-    task = make_task(env_id, starts, preset=preset, sim_config=config)
+    task = make_task(env_id, starts, preset=preset, config=config)
     try:
         task.reset(seed=seed)
-        action, success, stage = torch.zeros(starts, task.action_size), torch.zeros(0), torch.zeros(0)
+        action, failed = torch.zeros(starts, task.action_size), torch.zeros(starts, dtype=torch.bool)
+        success, stage = torch.zeros(0), torch.zeros(0)
         begun = time.process_time()
         for _ in range(task.max_steps):
             info = task.step(action)[-1]
-            success, stage = info["success"].float(), info["stage"].float()
+            failed |= info["fail"]
+            success, stage = (info["success"] & ~failed).float(), info["stage"].float()
         spent = time.process_time() - begun
         max_penetration = task.snapshot.max_penetration
     finally:

@@ -63,7 +63,6 @@ class DoraEnv(BaseEnv):
     SUPPORTED_REWARD_MODES = ("dense", "normalized_dense", "sparse", "none", "paper")
     TASK: ClassVar[type[Task]]
     """What the environment is about; set by `register_task`."""
-
     agent: Any
     """ManiSkill's: a `DescribedRobot`, or a `MultiAgent` of them."""
     task: Any
@@ -95,9 +94,10 @@ class DoraEnv(BaseEnv):
         obs_mode: str | None = None,
         **kwargs: Any,
     ):
+        numbers = task_config(self.TASK.CONFIG, preset, config, kwargs.get("sim_config"))
         options = check_options(
-            guidance, guidance_parts, hand_joints, task_config(self.TASK.CONFIG, preset, config), robot_uids,
-            self.TASK.robots(), num_envs, control_mode, sim_backend, render_backend, render_mode, obs_mode,
+            guidance, guidance_parts, hand_joints, numbers, robot_uids, self.TASK.robots(), num_envs, control_mode,
+            sim_backend, render_backend, render_mode, obs_mode,
         )  # fmt: skip
         self.parts, self.config = options.parts, options.config
         self._grasps = check_grasps(grasps, tuple(self.TASK.ARMS))

@@ -42,8 +42,13 @@ class TaskOptions:
     render_backend: str
 
 
-def task_config(cls: type[TaskConfig], preset: str, changes: Any) -> TaskConfig:
-    """The numbers of a task: its own, those of the preset (randomisation and `BY_PRESET`), then `changes`.
+SIM_RATES = {"sim_freq": "physics_frequency", "control_freq": "control_frequency"}
+"""Rates in ManiSkill's `sim_config`, and what they are called here."""
+
+
+def task_config(cls: type[TaskConfig], preset: str, changes: Any, sim_config: Any = None) -> TaskConfig:
+    """The numbers of a task: its own, those of the preset (randomisation and `BY_PRESET`), then `changes`, then the
+    rates of ManiSkill's `sim_config`, on which more than the physics depends here.
 
     Raises:
         InputError: for an unknown preset, an unknown name, a value of the wrong type, a number that is not finite or
@@ -51,7 +56,8 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Any) -> TaskConfig:
     """
     randomisation = find_preset(preset, cls.PRESETS)
     base: TaskConfig = replace(cls(), randomisation=randomisation, **cls.BY_PRESET.get(preset, {}))
-    config = overridden(base, changes or {}, "config")
+    rates = {ours: sim_config[theirs] for theirs, ours in SIM_RATES.items() if theirs in (sim_config or {})}
+    config = overridden(overridden(base, changes or {}, "config"), rates, "sim_config")
     check_finite(config, "config")
     check_not_negative(config, "config")
     check_not_negative(config.residual, "config.residual")
