@@ -9,11 +9,12 @@ down, so that it never comes back up: while the nail moves,
 The hammer's blow starts the nail at nearly the hammer's speed and is then spent against drag and resistance. Pushing
 moves it too, and a nail pushed in has not been hammered: a blow is an impact above `blow_speed` of the striking face on
 the nail's head. What the nail sinks within `blow_window` after one counts as driven while nothing but that face presses
-on the nail, and only as long as the nail is no faster than the momentum of hammer and hand by itself would drive it
-(`slowed`): once it is pushed on after a touch, the blow is over. A hammer that no hand holds strikes no blow.
+on the nail, and at most as far as the momentum of hammer and hand by itself would drive it (`driven_by_momentum`): more
+cannot be had by pushing on. A hammer that no hand holds strikes no blow.
 """
 
 from dataclasses import dataclass
+from math import inf, log1p
 
 import numpy as np
 import sapien
@@ -49,7 +50,7 @@ FACE_DEPTH, FACE_EDGE = 0.006, 0.003
 point of a contact lies between the two surfaces, which a blow presses into each other."""
 UPRIGHT = 0.7
 """Smallest vertical share of a contact's normal that presses the nail down, not aside [1]."""
-STATE = ("_depth", "_driven", "_since", "_speed", "_before", "_sinking", "_free", "_held")
+STATE = ("_depth", "_driven", "_since", "_speed", "_before", "_sinking", "_reach", "_left", "_held")
 """Buffers of a nail that its state holds."""
 DOWN = (0.7071068, 0.0, 0.7071068, 0.0)
 """Turns +x, the axis of joints and cylinders, into -z (wxyz): the joint's coordinate is the nail's depth."""
@@ -79,21 +80,28 @@ class NailSettings:
     """Speed of the striking face relative to the nail above which an impact is a blow [m/s]."""
     blow_window: float = 0.05
     """Time after a blow in which the nail's motion counts as driven, if nothing else touches the nail [s]."""
-    hand: float = 1.5
-    """Mass that strikes with the hammer, that of the DLR/HIT Hand II [kg]."""
+    hand: float = 0.75
+    """Mass of the hand that the nail feels: 1.5 kg, which turn 25 cm from the axis of the swing where the nail is 36 cm
+    from it, so that their inertia counts (25 / 36)^2 of it there [kg]."""
 
 
-def slowed(settings: NailSettings, speed: float, mass: float, dt: float) -> float:
-    """Speed of a nail after a moment in which nothing but the momentum of what struck it drives it on [m/s].
+def driven_by_momentum(settings: NailSettings, speed: float, mass: float) -> float:
+    """Depth to which a nail sinks that goes on with what struck it, and nothing pushes either [m].
+
+    The integral of v until m' dv/dt = -resistance - drag v has stopped it, with m' the mass of both:
+
+        m' / drag (v - resistance / drag log(1 + drag v / resistance)).
 
     Args:
-        settings: numbers of the nail.
-        speed: of the nail and of what struck it, before [m/s].
+        settings: numbers of the nail; without drag m' v^2 / (2 resistance), without resistance m' v / drag.
+        speed: of both, v [m/s].
         mass: of what struck it [kg].
-        dt: length of the moment [s].
     """
-    force = settings.resistance + settings.drag * speed
-    return max(speed - dt * force / (mass + settings.mass), 0.0)
+    mass, force, drag = mass + settings.mass, settings.resistance, settings.drag
+    if drag == 0:
+        return mass * speed**2 / (2 * force) if force > 0 else inf
+    spent = force / drag * log1p(drag * speed / force) if force > 0 else 0.0
+    return mass / drag * (speed - spent)
 
 
 def struck(settings: NailSettings, speed: float, sinking: float, mass: float) -> float:
@@ -131,7 +139,8 @@ class Nail:
         self._speed = np.zeros(n, np.float32)
         self._before = np.zeros(n, np.float32)
         self._sinking = np.zeros(n, np.float32)
-        self._free = np.zeros(n, np.float32)
+        self._reach = np.zeros(n, np.float32)
+        self._left = np.zeros(n, np.float32)
         self._held = np.zeros(n, np.float32)
         self._hammers: list[sapien.physx.PhysxRigidDynamicComponent] = []
         self._faces: Float[np.ndarray, "n 3"] = np.zeros((n, 3))
@@ -156,8 +165,8 @@ class Nail:
         self.articulation.set_qpos(torch.zeros(len(rows), 1, device=self._device))
         self.articulation.set_qvel(torch.zeros(len(rows), 1, device=self._device))
         index = rows.cpu().numpy()
-        for buffer in (self._depth, self._driven, self._speed, self._before, self._sinking, self._free, self._held):
-            buffer[index] = 0.0
+        for name in STATE:
+            getattr(self, name)[index] = 0.0
         self._since[index] = self.settings.blow_window
         self._hold(index.tolist())
         self._look(index.tolist())
@@ -183,8 +192,6 @@ class Nail:
         body, before = self._bodies[i], self._depth[i]
         depth = float(body.qpos[0])
         self._since[i] += self._dt
-        if self._free[i] > 0:
-            self._free[i] = slowed(self.settings, float(self._free[i]), self._mass(i), self._dt)
         blow = False
         if depth > before + MOVED:
             face, other = self._pressed(i, contacts)
@@ -192,10 +199,11 @@ class Nail:
             blow = face and bool(self._held[i]) and speed > self.settings.blow_speed
             if blow:
                 self._strike(i, speed, float(self._sinking[i]) if speed == self._speed[i] else 0.0)
-            if self._since[i] < self.settings.blow_window and not other and body.qvel[0] <= self._free[i]:
-                self._driven[i] += depth - before
-            else:
-                self._free[i] = 0.0
+            if other or self._since[i] >= self.settings.blow_window:
+                self._left[i] = 0.0
+            counted = min(depth - before, self._left[i])
+            self._driven[i] += counted
+            self._left[i] -= counted
             self._depth[i] = depth
             self._limit(i)
         self._before[i] = 0.0 if blow else self._speed[i]
@@ -205,8 +213,14 @@ class Nail:
     def _strike(self, i: int, speed: float, sinking: float) -> None:
         """A blow begins, or goes on in the next physics step: of the face at a speed relative to the nail, which sinks
         already [m/s]."""
-        self._free[i] = max(self._free[i], struck(self.settings, speed, sinking, self._mass(i)))
-        self._since[i] = 0.0
+        mass = self._mass(i)
+        reach = driven_by_momentum(self.settings, struck(self.settings, speed, sinking, mass), mass)
+        if self._left[i] > 0:  # the same blow
+            reach = max(reach, self._reach[i])
+            self._left[i] += reach - self._reach[i]
+        else:
+            self._left[i] = reach
+        self._reach[i], self._since[i] = reach, 0.0
 
     def _mass(self, i: int) -> float:
         """Mass that strikes in environment i [kg]."""

@@ -80,7 +80,7 @@ class HammerConfig(TaskConfig):
     """Numbers of the task."""
 
     definition: Annotated[int, tyro.conf.Suppress] = 2
-    """2: a blow ends when the nail is pushed on, and a hammer that is not held strikes none (November 2026)."""
+    """2: a blow counts as far as momentum would drive, and a hammer that is not held strikes none (November 2026)."""
     control_frequency: int = 40
     """Control steps per second [Hz]."""
     physics_frequency: int = 240
