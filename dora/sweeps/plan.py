@@ -20,7 +20,7 @@ Guidance = tuple[str, tuple[str, ...] | None]
 """Name of the guidance and its parts, None for all."""
 AFFORDANCE, GRASPS, NONE, PAPERS = ("affordance", None), ("grasps", None), ("none", None), ("affordance", MECHANISM)
 """The kinds of guidance that are compared."""
-ONE_ARM = {"DoraCube-v1": 300_000, "DoraJug-v1": 300_000, "DoraHammer-v1": 400_000}
+ONE_ARM = {"DoraCube-v1": 300_000, "DoraJug-v1": 300_000, "DoraHammer-v1": 300_000}
 """Environment steps of a run of each task of one arm, the same for all learners."""
 TWO_ARMS = {"DoraMicrowave-v1": 400_000}
 """The same of tasks of two arms."""

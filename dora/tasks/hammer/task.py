@@ -174,7 +174,7 @@ class HammerTask(Task):
     }
     LEARNERS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "sac": {
-            "total_steps": 400_000, "stop_success": 0.97, "num_envs": 32, "eval_every": 100_000, "eval_episodes": 100,
+            "total_steps": 300_000, "stop_success": 0.97, "num_envs": 32, "eval_every": 75_000, "eval_episodes": 100,
             "eval_envs": 50, "after_success": 20,
         },
         "ppo": {
