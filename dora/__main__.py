@@ -3,14 +3,13 @@
 What does the work is imported only when it is needed, so that help and version come at once.
 """
 
-import difflib
 import importlib
 import operator
 import sys
 from collections.abc import Callable, Sequence
 
 from dora import quiet_start
-from dora.errors import BAD_INPUT, ManiSkillMissingError
+from dora.errors import BAD_INPUT, ManiSkillMissingError, suggestion
 from dora.version import version_line
 
 COMMANDS = {
@@ -73,9 +72,7 @@ def main(words: Sequence[str] | None = None, around: Callable[[Callable[[], int]
     if first == "--completion":
         return _complete(rest)
     if first not in COMMANDS:
-        near = difflib.get_close_matches(first, COMMANDS, 1)
-        hint = f" Did you mean {near[0]!r}?" if near else ""
-        print(f"dora has no command {first!r}.{hint} The commands are: {', '.join(COMMANDS)}.", file=sys.stderr)
+        print(f"dora has no command {first!r}: {suggestion(first, COMMANDS)}", file=sys.stderr)
         return BAD_INPUT
     sys.argv = [f"dora {first}", *rest]
     try:

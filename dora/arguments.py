@@ -1,7 +1,6 @@
 """Arguments as callers write them: environments, seeds, arrays and names, made plain or refused in one sentence."""
 
-import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,6 @@ from dora.errors import InputError
 
 SEEDS = 2**32
 """Number of seeds that numpy's generators take [1]: 0 and up."""
-
-
-def suggestion(name: Any, known: Iterable[str]) -> str:
-    """What a message about an unknown name ends with: the nearest known name, or all of them."""
-    names = list(known)
-    near = difflib.get_close_matches(str(name), names, 1)
-    return f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(names)}."
 
 
 def as_tensor(value: Any, what: str, device: torch.device | str | None = None) -> Tensor:

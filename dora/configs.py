@@ -1,13 +1,12 @@
 """Configurations as frozen dataclasses: overriding fields by name, and reading them back from plain data, checked."""
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, get_type_hints
 
 import dacite
 
-from dora.errors import InputError, shown
+from dora.errors import InputError, shown, suggestion
 
 C = TypeVar("C")
 """A frozen dataclass whose fields are numbers, texts, tuples or such dataclasses."""
@@ -66,9 +65,7 @@ def _merged(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> d
     merged = dict(values)
     for name, value in changes.items():
         if name not in values:
-            near = difflib.get_close_matches(str(name), values, 1)
-            hint = f"did you mean {near[0]!r}?" if near else f"choose among {', '.join(values)}."
-            raise InputError(f"{where} has no field {shown(str(name))}: {hint}")
+            raise InputError(f"{where} has no field {shown(str(name))}: {suggestion(name, values)}")
         if isinstance(value, bool) and not isinstance(values[name], bool | None):
             raise InputError(f"{where}.{name} must be a number or a text, not {value}.")
         if isinstance(values[name], dict) and isinstance(value, Mapping):
@@ -111,9 +108,7 @@ def built(cls: type[C], values: Mapping[str, Any], what: str = "settings") -> C:
     loose = dataclasses.make_dataclass(cls.__name__, [(n, hints[n], f) for n, f in known.items()], kw_only=True)
     for name in values:
         if name not in known:
-            near = difflib.get_close_matches(str(name), known, 1)
-            hint = f"did you mean {near[0]!r}?" if near else "remove it."
-            raise InputError(f"{what}: there is no {shown(name)}; {hint}")
+            raise InputError(f"{what} has no field {shown(name)}: {suggestion(name, known)}")
     try:
         checked = dacite.from_dict(loose, values, RULES)
     except (dacite.DaciteError, TypeError, ValueError) as error:

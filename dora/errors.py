@@ -1,10 +1,11 @@
-"""The exceptions that Dora raises for what people can correct, and for runs that fail; values as messages show them."""
+"""The exceptions that Dora raises for what people can correct, and for runs that fail; values and hints in messages."""
 
+import difflib
 import functools
 import reprlib
 import sys
-from collections.abc import Callable
-from typing import ParamSpec
+from collections.abc import Callable, Iterable
+from typing import Any, ParamSpec
 
 RECORDS = "DORA_NONFINITE"
 """Environment variable with the folder for the last states of simulations that were not finite."""
@@ -70,6 +71,19 @@ def shown(value: object) -> str:
     short.maxstring = short.maxother = LONGEST_VALUE
     short.maxlevel = DEEPEST_VALUE
     return short.repr(value)
+
+
+def suggestion(name: Any, known: Iterable[str], otherwise: str = "") -> str:
+    """What a message about an unknown name ends with: the nearest known name, or all of them.
+
+    Args:
+        name: what was asked for.
+        known: the names there are.
+        otherwise: said in place of all names where none is near, because there are too many to list.
+    """
+    names = list(known)
+    near = difflib.get_close_matches(str(name), names, 1)
+    return f"did you mean {near[0]!r}?" if near else otherwise or f"choose one of {', '.join(names)}."
 
 
 def said(kind: str, message: object) -> str:

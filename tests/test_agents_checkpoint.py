@@ -73,7 +73,7 @@ def test_damaged_files_are_refused(path: Path, tmp_path: Path):
         ("learner", {"added": 10**400}, "learner has to be finite numbers"),
         ("learner", {"added": "all"}, "learner has to be finite numbers"),
         ("learner", [3], "learner has to be finite numbers"),
-        ("epochs", 3, "there is no 'epochs'"),
+        ("epochs", 3, "has no field 'epochs'"),
     ],
 )
 def test_counters_of_a_wrong_type_or_size_are_refused(path: Path, name: str, value: object, words: str):

@@ -47,7 +47,7 @@ def script() -> ModuleType:
     [
         ("", "--env"),
         ("--env Nope-v1", "unknown environment 'Nope-v1'"),
-        ("--env DoraCub-v1", "did you mean DoraCube-v1?"),
+        ("--env DoraCub-v1", "did you mean 'DoraCube-v1'?"),
         ("--env DoraCube-v1 --num-envs 0", "--num-envs is 0"),
         ("--env DoraCube-v1 --total-steps -5", "--total-steps is -5"),
         ("--env DoraCube-v1 --workers -1", "--workers is -1"),

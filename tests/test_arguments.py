@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from dora.arguments import as_tensor, checked_rows, checked_seeds, suggestion, tensors
-from dora.errors import InputError
+from dora.arguments import as_tensor, checked_rows, checked_seeds, tensors
+from dora.errors import InputError, suggestion
 
 COUNT = 4
 
@@ -168,3 +168,4 @@ def test_a_changed_array_does_not_change_the_tensor():
 def test_the_nearest_name_is_suggested():
     assert suggestion("stat", ["state", "none"]) == "did you mean 'state'?"
     assert suggestion("xyz", ["state", "none"]) == "choose one of state, none."
+    assert suggestion("xyz", ["state", "none"], "see the page.") == "see the page."

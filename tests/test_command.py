@@ -76,7 +76,7 @@ def test_every_command_is_listed_and_has_help(capsys: pytest.CaptureFixture[str]
 @pytest.mark.parametrize(("typed", "meant"), [("rum", "'run'"), ("grasp", "'grasps'")])
 def test_a_typo_gets_a_suggestion(capsys: pytest.CaptureFixture[str], typed: str, meant: str):
     assert command.main([typed]) == command.BAD_INPUT
-    assert f"Did you mean {meant}" in capsys.readouterr().err
+    assert f"did you mean {meant}" in capsys.readouterr().err
 
 
 def test_without_a_command_the_usage_is_shown(capsys: pytest.CaptureFixture[str]):

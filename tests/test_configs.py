@@ -51,7 +51,7 @@ def test_fields_are_overridden_by_name_and_the_others_stay():
     ("changes", "words"),
     [
         ({"lenght": 1.0}, "config has no field 'lenght': did you mean 'length'?"),
-        ({"qqq": 1.0}, "choose among length, count"),
+        ({"qqq": 1.0}, "choose one of length, count"),
         ({"inner": {"wait": 1.0}}, "config.inner has no field 'wait'"),
         ({"length": "far"}, "length must be float, not 'far'"),
         ({"count": 1.5}, "count must be int, not 1.5"),
@@ -192,7 +192,7 @@ def test_printing_an_environment_shows_the_tables_in_force(capsys: pytest.Captur
     task.close()
 
 
-@pytest.mark.parametrize(("words", "message"), [([], "Say which task"), (["DoraJog-v1"], "did you mean DoraJug-v1")])
+@pytest.mark.parametrize(("words", "message"), [([], "Say which task"), (["DoraJog-v1"], "did you mean 'DoraJug-v1'")])
 def test_describing_nothing_is_refused(words: list[str], message: str, capsys: pytest.CaptureFixture[str]):
     assert describe.main(words) == 2
     assert message in capsys.readouterr().err

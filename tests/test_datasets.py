@@ -324,7 +324,7 @@ def test_sigterm_leaves_nothing(tmp_path: Path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["DoraCub-v1"], "did you mean DoraCube-v1"),
+        (["DoraCub-v1"], "did you mean 'DoraCube-v1'"),
         ([ENV, "--policy", "nowhere"], "nowhere"),
         ([ENV, "--episodes", "0"], "--episodes is 0"),
         ([ENV, "--seed", str(2**31 - 2)], "seed of the first start"),

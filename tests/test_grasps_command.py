@@ -55,7 +55,7 @@ def script() -> ModuleType:
         ("--object jug --out /proc/nowhere/a.safetensors", "choose another --out"),
         ("--object jug --robot ur5", "unknown robot 'ur5'"),
         ("--mesh nowhere.stl", "nowhere.stl"),
-        ("--object hamer", "no object 'hamer'; did you mean hammer? choose one of: cube, hammer, jug, microwave"),
+        ("--object hamer", "no object 'hamer', nor a folder or mesh at that path: did you mean 'hammer'?"),
         ("--make-bundle", "need --object"),
         ("--contact-maps", "need --object"),
         ("--contact-maps --object spoon", "no object 'spoon'"),

@@ -230,7 +230,7 @@ def test_a_busy_port_is_refused(watched: Watched, page: Page):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("DoraHamer-v1",), "did you mean DoraHammer-v1"),
+        (("DoraHamer-v1",), "did you mean 'DoraHammer-v1'"),
         (("DoraCube-v1", "--port", "0"), "--port is 0"),
         (("DoraCube-v1", "--seed", "-1"), "--seed is -1"),
         (("DoraCube-v1", "--checkpoint", "none.safetensors"), "There is no checkpoint none.safetensors"),

@@ -240,7 +240,7 @@ def test_a_preset_is_in_force_from_the_next_episode_on(cube: Watched):
     assert (state.preset, state.episode.step) == ("hard", 0)
     assert cube.env.config.randomisation.push > 0
     assert state.scales["cube"] != 1.0
-    assert "unknown preset 'harder'; did you mean 'hard'?" in cube.do(Randomise("harder")).message
+    assert "unknown preset 'harder': did you mean 'hard'?" in cube.do(Randomise("harder")).message
 
 
 def test_a_policy_keeps_its_numbers_of_the_task_under_another_preset():
@@ -378,5 +378,5 @@ def test_nobody_who_acts_and_unknown_names_are_refused():
         Session("DoraCube-v1", [])
     with pytest.raises(InputError, match="did you mean 'standard'"):
         Session("DoraCube-v1", [zero_correction({})], preset="standart")
-    with pytest.raises(InputError, match="did you mean DoraCube-v1"):
+    with pytest.raises(InputError, match="did you mean 'DoraCube-v1'"):
         Session("DoraCub-v1", [zero_correction({})])

@@ -167,8 +167,8 @@ def test_objects_are_found_in_further_folders(folder: Path, monkeypatch: pytest.
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("jugg", "there is no object 'jugg'; did you mean jug[?] choose one of: cube, hammer, jug, microwave"),
-        ("spoon", "there is no object 'spoon'; choose one of: cube, hammer, jug, microwave"),
+        ("jugg", "there is no object 'jugg', nor a folder or mesh at that path: did you mean 'jug'[?]"),
+        ("spoon", "there is no object 'spoon', nor a folder or mesh at that path: choose one of cube, hammer, jug"),
         ("", "no object.toml"),
         ("x" * 5000, "there is no object"),
         ("a\0b", "there is no object"),

@@ -100,7 +100,7 @@ def test_an_observation_that_does_not_fit_is_refused_with_a_remedy(obs: object, 
 
 
 def test_wrong_ids_and_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="did you mean DoraCube-v1"):
+    with pytest.raises(InputError, match="did you mean 'DoraCube-v1'"):
         dora.load_policy("DoraCub-v1")
     with pytest.raises(InputError, match="checkpoint"):
         dora.load_policy(tmp_path / "policy.safetensors")

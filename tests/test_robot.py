@@ -283,9 +283,12 @@ def test_robots_are_found_in_further_folders(folder, monkeypatch):
     assert load_robot("spoiled").folder == folder.resolve()
 
 
-def test_an_unknown_robot_lists_those_available():
-    with pytest.raises(InputError, match=r"unknown robot 'diana8'.*diana7_hit"):
-        load_robot("diana8")
+@pytest.mark.parametrize(
+    ("name", "hint"), [("diana7_hti", "did you mean 'diana7_hit'[?]"), ("ur5", "choose one of .*diana7_hit")]
+)
+def test_an_unknown_robot_is_refused_with_a_suggestion(name: str, hint: str):
+    with pytest.raises(InputError, match=f"unknown robot '{name}': {hint}"):
+        load_robot(name)
 
 
 TOML, URDF = "robot.toml", "robot.urdf"

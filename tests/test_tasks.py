@@ -298,7 +298,7 @@ def test_bad_options_get_one_clear_sentence(options: dict, words: str):
 
 
 def test_unknown_ids_are_refused_with_a_suggestion():
-    with pytest.raises(InputError, match="did you mean DoraCube-v1"):
+    with pytest.raises(InputError, match="did you mean 'DoraCube-v1'"):
         tasks.make_task("DoraCub-v1", 1)
 
 

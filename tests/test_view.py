@@ -258,7 +258,7 @@ def test_bad_sources(
     replace(candidates, digest="0").save(tmp_path / "old.safetensors")
     (tmp_path / "broken.safetensors").write_bytes(b"nothing")
     cases = {
-        "spoon": "no object 'spoon'; choose one of: cube, hammer, jug, microwave",
+        "spoon": "no object 'spoon', nor a folder or mesh at that path: choose one of cube, hammer, jug, microwave",
         "mug.safetensors": "--mesh",
         "old.safetensors": "another shape or labelling",
         "broken.safetensors": "damaged",

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import dora
-from dora.errors import InputError, shown
+from dora.errors import InputError, shown, suggestion
 from dora.reading import read_toml
 from dora.robot.description import Contact, Coupling, Finger, JointGroup, Posture, RobotDescription
 from dora.robot.urdf import UrdfModel, read_urdf
@@ -67,8 +67,8 @@ def load_robot(name_or_folder: str | Path) -> RobotDescription:
     folders = robot_folders()
     folder = folders.get(str(name_or_folder), Path(name_or_folder))
     if not (folder / ROBOT_FILE).is_file():
-        known = ", ".join(sorted(folders)) or "none"
-        raise InputError(f"unknown robot {str(name_or_folder)!r}; available robots: {known}.")
+        hint = suggestion(name_or_folder, sorted(folders))
+        raise InputError(f"unknown robot {str(name_or_folder)!r}: {hint}")
     return _load(folder.resolve())
 
 

@@ -10,8 +10,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Link
 
-from dora.arguments import suggestion
-from dora.errors import InputError, shown
+from dora.errors import InputError, shown, suggestion
 from dora.sim.batch.rendering import wants_pictures
 
 Point = tuple[float, float, float]

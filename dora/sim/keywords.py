@@ -20,8 +20,7 @@ from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS
 from mani_skill.utils.registration import EnvSpec
 from mani_skill.utils.structs.types import SimConfig
 
-from dora.arguments import suggestion
-from dora.errors import InputError, shown
+from dora.errors import InputError, shown, suggestion
 from dora.sim.batch.hooks import BACKEND, batched_by_default
 
 SIM_BACKENDS = ("auto", BACKEND, *backends.sim_backend_name_mapping)

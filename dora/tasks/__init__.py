@@ -1,13 +1,12 @@
 """The task suite. Importing it registers every task found here with ManiSkill and gymnasium."""
 
-import difflib
 import importlib
 import pkgutil
 from typing import Any
 
 import gymnasium as gym
 
-from dora.errors import InputError
+from dora.errors import InputError, suggestion
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.env.registration import TASKS
 from dora.tasks.env.task import Task
@@ -31,9 +30,7 @@ def task_ids() -> list[str]:
 def check_task_id(env_id: str) -> None:
     """Refuses ids that are not registered with an InputError, which names the nearest one that is."""
     if env_id not in task_ids():
-        near = difflib.get_close_matches(env_id, task_ids(), 1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        raise InputError(f"unknown environment {env_id!r}{hint} (known: {', '.join(task_ids())})")
+        raise InputError(f"unknown environment {env_id!r}: {suggestion(env_id, task_ids())}")
 
 
 def find_task(env_id: str) -> type[Task]:

@@ -1,6 +1,5 @@
 """Environment steps per second: ours against ManiSkill's own way of using several cores, on the same task."""
 
-import difflib
 import multiprocessing
 import time
 from collections import Counter
@@ -16,7 +15,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
 import dora  # noqa: F401  (registers Dora's tasks)
-from dora.errors import InputError
+from dora.errors import InputError, suggestion
 from dora.parallel import PATIENCE_OF_CASES, run_cases
 from dora.sim import BACKEND, StepProfile, can_render
 from dora.sim.batch.rendering import refuse_pictures, replace_materials, wants_pictures
@@ -85,9 +84,8 @@ def measure(env_id: str, num_envs: int, workers: int, seconds: float, obs_mode: 
             option = name.replace("_", "-")
             raise InputError(f"--{option} is {value}: it must be positive, and at most {MOST[name]}.")
     if env_id not in gym.registry:
-        near = difflib.get_close_matches(env_id, gym.registry, 1)
-        hint = f"did you mean {near[0]}?" if near else "see gymnasium.registry for the ids."
-        raise InputError(f"There is no task {env_id!r}: {hint}")
+        hint = suggestion(env_id, gym.registry, "see gymnasium.registry for the ids.")
+        raise InputError(f"there is no task {env_id!r}: {hint}")
     if wants_pictures(obs_mode) and not can_render():
         refuse_pictures(obs_mode, None)
     together = multiprocessing.get_context("spawn").Barrier(workers)

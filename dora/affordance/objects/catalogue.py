@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import os
 from pathlib import Path
@@ -11,7 +10,7 @@ import dora
 from dora.affordance.objects.affordance_object import AffordanceObject, Piece
 from dora.affordance.objects.folder_reading import OBJECT_FILE, read_object_folder
 from dora.affordance.objects.importing import import_object
-from dora.errors import InputError
+from dora.errors import InputError, suggestion
 
 __all__ = ["AffordanceObject", "Piece", "available_objects", "load_object"]
 
@@ -61,12 +60,8 @@ def load_object(name: str | Path) -> AffordanceObject:
         return _read_folder(path.resolve())
     if os.path.isfile(path):
         return _read_mesh(path.resolve(), path.stat().st_mtime_ns)
-    near = difflib.get_close_matches(str(name), places, 1)
-    hint = f"did you mean {near[0]}? " if near else ""
-    raise InputError(
-        f"there is no object {str(name)!r}; {hint}choose one of: {', '.join(sorted(places))}, "
-        "or give the path of a folder or mesh."
-    )
+    hint = suggestion(name, sorted(places))
+    raise InputError(f"there is no object {str(name)!r}, nor a folder or mesh at that path: {hint}")
 
 
 @functools.cache

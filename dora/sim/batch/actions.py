@@ -8,8 +8,8 @@ import torch
 from gymnasium import spaces
 from jaxtyping import Bool, Float
 
-from dora.arguments import as_tensor, suggestion
-from dora.errors import InputError
+from dora.arguments import as_tensor
+from dora.errors import InputError, suggestion
 
 MOST_LISTED = 8
 """Environments that a message names at most [1]."""

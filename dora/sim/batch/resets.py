@@ -10,8 +10,8 @@ from jaxtyping import Int
 from mani_skill.utils import common
 from torch import Tensor
 
-from dora.arguments import as_tensor, checked_rows, checked_seeds, is_mask, suggestion, tensors
-from dora.errors import InputError
+from dora.arguments import as_tensor, checked_rows, checked_seeds, is_mask, tensors
+from dora.errors import InputError, suggestion
 
 START, STATES = "reset_to_env_states", "env_states"
 """Option of `reset` with states in which episodes begin, and its entry for them."""

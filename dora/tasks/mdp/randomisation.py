@@ -1,10 +1,9 @@
 """How much an episode is randomised and perturbed: named presets, the same for every task."""
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from dora.errors import InputError
+from dora.errors import InputError, suggestion
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +75,5 @@ PRESETS: dict[str, Randomisation] = {
 def find_preset(name: str, presets: Mapping[str, Randomisation] = PRESETS) -> Randomisation:
     """The preset called `name` among a task's; raises InputError for an unknown one."""
     if name not in presets:
-        near = difflib.get_close_matches(str(name), presets, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise InputError(f"unknown preset {name!r}{hint} (choose one of {', '.join(presets)})")
+        raise InputError(f"unknown preset {name!r}: {suggestion(name, presets)}")
     return presets[name]
