@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dora.geometry.poses import Pose
+from dora.geometry.poses import Pose, blend
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.tasks.guidance.candidate_choice import CandidateChoice
 from dora.tasks.mdp.buffers import Buffers
@@ -148,11 +148,8 @@ class Perturbations:
         if arm not in self._filtered:
             return measured
         count, p, q = (getattr(self.buffers, f"{arm}_{name}") for name in ESTIMATE)
-        share = (1 / (count + 1)).clamp_min(self._share)[:, None]
-        same = torch.where((q * measured[1]).sum(-1, keepdim=True) < 0, -measured[1], measured[1])
-        mean = q + share * (same - q)
         new = ((count == 0) | ((measured[0] - p).norm(dim=-1) > MOVED))[:, None]
-        estimate = p + share * (measured[0] - p), mean / mean.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+        estimate = blend((p, q), measured, (1 / (count + 1)).clamp_min(self._share))
         return torch.where(new, measured[0], estimate[0]), torch.where(new, measured[1], estimate[1])
 
     def remember(self, observed: Snapshot) -> None:

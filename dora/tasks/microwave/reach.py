@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
-from dora.geometry.poses import Pose, compose, relative
+from dora.geometry.poses import Pose, carried, compose, relative
 from dora.geometry.rotations import quaternion_apply, quaternion_from_rotation_vector, quaternion_multiply
 from dora.robot.motion.inverse_kinematics import InverseKinematics
 from dora.tasks.env.arm import Arm
@@ -85,14 +85,6 @@ def oven_reach(
     return OvenReach(grid.to(arm.agent.device), scale.to(arm.agent.device), followed.to(arm.agent.device))
 
 
-def each(body: Pose, candidates: GraspCandidates) -> Pose:
-    """Wrist poses (m, c, ...) of c candidates on m bodies."""
-    m, c = len(body[0]), len(candidates)
-    p, q = (x[:, None].expand(m, c, x.shape[-1]) for x in body)
-    position = p + quaternion_apply(q, candidates.position.expand(m, c, 3))
-    return position, quaternion_multiply(q, candidates.quaternion.expand(m, c, 4))
-
-
 def opening_way(hinge: Pose, handle: Pose, back: float, target: float) -> Way:
     """The way of the arm that opens the door.
 
@@ -113,12 +105,13 @@ def opening_way(hinge: Pose, handle: Pose, back: float, target: float) -> Way:
             return compose(door, (handle[0].expand(len(p), 3), handle[1].expand(len(p), 4)))
 
         shut = at(0.0)
-        wrist = each(shut, candidates)
+        wrist = carried(candidates.position, candidates.quaternion, *shut)
         turned = shut[1][:, None].expand(-1, len(candidates), 4)
         approach = quaternion_apply(turned, candidates.approach.expand(len(p), -1, 3))
         far = [(wrist[0] - back * share * approach, wrist[1]) for share in _shares(back)]
         arc = math.ceil(target / ARC)
-        return [*far, *(each(at(target * k / arc), candidates) for k in range(arc + 1))]
+        doors = [at(target * k / arc) for k in range(arc + 1)]
+        return [*far, *(carried(candidates.position, candidates.quaternion, *door) for door in doors)]
 
     return way
 
