@@ -9,6 +9,7 @@ from torch import Tensor
 from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.objects.signed_distance import CHANNELS, SignedDistanceField
 from dora.geometry.rotations import matrix_from_quaternion
+from dora.geometry.segments import distance_to_segment
 
 CONTACT_DISTANCE = 5e-3
 """Distance between hand and surface below which they are in contact [m]."""
@@ -59,15 +60,11 @@ def _nearest_part(
     A capsule is compared with the points in the ball around it only.
     """
     (count, capsules, _), size = start.shape, len(points)
-    axis = (end - start).flatten(0, 1)
-    ball = axis.norm(dim=-1) / 2 + radius.repeat(count) + contact_distance + SLACK
+    ball = (end - start).flatten(0, 1).norm(dim=-1) / 2 + radius.repeat(count) + contact_distance + SLACK
     near = torch.cdist((start + end).flatten(0, 1) / 2, points) < ball[:, None]
     row, point = near.nonzero().unbind(1)
     capsule, cell = row % capsules, row.div(capsules, rounding_mode="floor") * size + point
-    axis, away = axis[row], points[point] - start.flatten(0, 1)[row]
-    square = axis.square().sum(-1).clamp_min(torch.finfo(axis.dtype).tiny)
-    share = ((away * axis).sum(-1) / square).clamp(0, 1)
-    gap = (away - share[:, None] * axis).norm(dim=-1) - radius[capsule]
+    gap = distance_to_segment(points[point], start.flatten(0, 1)[row], end.flatten(0, 1)[row]) - radius[capsule]
     least = gap.new_full((count * size,), contact_distance).scatter_reduce_(0, cell, gap, "amin")
     winning = (gap < contact_distance) & (gap == least[cell])
     winner = capsule.new_full((count * size,), capsules)

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.geometry.rotations import quaternion_apply, quaternion_inverse
+from dora.geometry.segments import distance_to_segment
 from dora.tasks.mdp.quantities import in_wrist
 from dora.tasks.mdp.snapshot import Snapshot, derived
 
@@ -71,10 +72,8 @@ def face_to_nail(s: HammerSnapshot) -> Float[Tensor, "n 3"]:
 def handle_distance(s: HammerSnapshot, point: Float[Tensor, "n k 3"]) -> Float[Tensor, "n k"]:
     """Distance of points (world frame) from the handle's axis, a line between its two ends [m]."""
     q = quaternion_inverse(s.object.q)[:, None].expand(-1, point.shape[1], -1)
-    local = quaternion_apply(q, point - s.object.p[:, None]) - s.butt[:, None]
-    along = (s.neck - s.butt)[:, None]
-    share = ((local * along).sum(-1, keepdim=True) / along.square().sum(-1, keepdim=True)).clamp(0, 1)
-    return (local - share * along).norm(dim=-1)
+    local = quaternion_apply(q, point - s.object.p[:, None])
+    return distance_to_segment(local, s.butt[:, None], s.neck[:, None])
 
 
 @derived

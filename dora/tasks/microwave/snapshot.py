@@ -17,6 +17,7 @@ from dora.geometry.rotations import (
     quaternion_multiply,
     rotation_vector_from_quaternion,
 )
+from dora.geometry.segments import distance_to_segment
 from dora.tasks.mdp.quantities import box_distance, in_wrist, thumb_and_finger, tips_in_object, turned_in_wrist
 from dora.tasks.mdp.snapshot import Snapshot, derived
 
@@ -104,11 +105,7 @@ def hands_out(s: MicrowaveSnapshot) -> Bool[Tensor, " n"]:
 @derived
 def handle_distance(s: MicrowaveSnapshot) -> Float[Tensor, "n fingers"]:
     """Distance of each of the left hand's fingertips from the surface of the handle's bar [m], negative inside."""
-    tips = tips_in_object(s)
-    start, along = s.bar[0], s.bar[1] - s.bar[0]
-    share = (((tips - start) * along).sum(-1) / along.square().sum()).clamp(0, 1)
-    away = (tips - start - share[..., None] * along).norm(dim=-1)
-    return away - s.bar_radius - s.hand.tip_radius
+    return distance_to_segment(tips_in_object(s), s.bar[0], s.bar[1]) - s.bar_radius - s.hand.tip_radius
 
 
 def is_left(s: Snapshot) -> bool:
