@@ -82,6 +82,23 @@ def test_rpy_from_z_axis_points_along_the_direction(direction):
     np.testing.assert_allclose(rotation.apply([0, 0, 1]), direction / np.linalg.norm(direction), atol=EXACT)
 
 
+@pytest.mark.parametrize("yaw", [0.0, 1e-8, 1.2, -2.0, np.pi - 1e-6, 3.5, 2 * np.pi - 0.1, -7.0])
+def test_a_yaw_is_a_turn_about_the_vertical(yaw: float):
+    q = rot.quaternion_from_yaw(tensor(yaw))
+    assert same_rotation(q, Rotation.from_euler("z", yaw))
+    wrapped = (yaw + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose([rot.yaw_of(q), rot.yaw_of(-q)], wrapped, atol=EXACT)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3, 2.0])
+def test_a_tilt_does_not_change_the_yaw(tilt: float):
+    yaw = tensor([[0.4, -2.9, 1.0]])
+    turn = rot.quaternion_from_yaw(yaw)
+    lean = rot.quaternion_from_rotation_vector(tensor([tilt * np.cos(2.0), tilt * np.sin(2.0), 0.0])).expand(1, 3, 4)
+    for q in (rot.quaternion_multiply(turn, lean), rot.quaternion_multiply(lean, turn)):
+        np.testing.assert_allclose(rot.yaw_of(q), yaw, atol=EXACT)
+
+
 def test_batches_broadcast():
     q = rot.quaternion_from_rotation_vector(torch.randn(5, 1, 3))
     assert rot.quaternion_multiply(q, q[:1, 0]).shape == (5, 1, 4)
@@ -98,7 +115,7 @@ def test_gradients_are_finite_everywhere(angle):
         rot.rotation_vector_from_quaternion(q),
         rot.rotation_vector_from_quaternion(rot.quaternion_from_matrix(rot.matrix_from_quaternion(q))),
     )
-    for output in (*outputs, rot.rotation_angle(q, q)):
+    for output in (*outputs, rot.rotation_angle(q, q), rot.yaw_of(q), rot.quaternion_from_yaw(v)):
         (gradient,) = torch.autograd.grad(output.sum(), v, retain_graph=True)
         assert gradient.isfinite().all()
 

@@ -108,6 +108,22 @@ def rotation_angle(a: Float[Tensor, "*#batch 4"], b: Float[Tensor, "*#batch 4"])
     return rotation_vector_from_quaternion(quaternion_multiply(quaternion_inverse(a), b)).norm(dim=-1)
 
 
+def quaternion_from_yaw(yaw: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 4"]:
+    """Quaternion wxyz of a turn about the vertical, +z, by angles of any size and sign [rad]."""
+    half = 0.5 * yaw
+    zero = torch.zeros_like(half)
+    return torch.stack((half.cos(), zero, zero, half.sin()), -1)
+
+
+def yaw_of(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch"]:
+    """Angle of the turn about the vertical, from -pi to pi [rad], of a unit quaternion wxyz of either sign.
+
+    A tilt that comes after or before the turn does not change it; upside down, where there is no such angle, it is 0.
+    """
+    q = torch.where(q[..., :1] < 0, -q, q)
+    return 2 * torch.atan2(q[..., 3], q[..., 0])
+
+
 def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
     """Quaternion wxyz of URDF's fixed-axis angles [rad]: about x, then y, then z of the parent frame."""
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a / 2), math.sin(a / 2)) for a in (roll, pitch, yaw))

@@ -22,7 +22,13 @@ from dora.affordance.reach.feasibility import Reach
 from dora.digests import digest_of
 from dora.errors import InputError
 from dora.files import read_tensors, stored_or_made, write_tensors
-from dora.geometry.rotations import quaternion_apply, quaternion_inverse, quaternion_multiply
+from dora.geometry.rotations import (
+    quaternion_apply,
+    quaternion_from_yaw,
+    quaternion_inverse,
+    quaternion_multiply,
+    yaw_of,
+)
 from dora.robot.motion import inverse_kinematics
 
 FORMAT = "dora-reach 1"
@@ -181,10 +187,9 @@ class ReachTable:
         """x, y [m] and yaw [rad] of objects at world poses ([m], wxyz), and whether they rest as the table assumes."""
         rest = object_q.new_tensor(self.rest)
         turn = quaternion_multiply(object_q, quaternion_inverse(rest).expand_as(object_q))
-        yaw = 2 * torch.atan2(turn[:, 3], turn[:, 0])
         up = quaternion_apply(turn, turn.new_tensor([0.0, 0.0, 1.0]).expand(len(turn), 3))
         level = (up[:, 2] > math.cos(MAX_TILT)) & ((object_p[:, 2] - self.height).abs() < MAX_RISE)
-        return torch.cat([object_p[:, :2], yaw[:, None]], -1), level
+        return torch.cat([object_p[:, :2], yaw_of(turn)[:, None]], -1), level
 
     def save(self, path: Path | str) -> None:
         """Write a safetensors file, atomically.
@@ -256,7 +261,5 @@ def poses(
     nodes: Float[Tensor, "m 3"], height: float, rest: tuple[float, float, float, float]
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:
     """World poses ([m], wxyz) of an object that rests at the nodes (x, y [m], yaw [rad])."""
-    half, zero = nodes[:, 2] / 2, torch.zeros(len(nodes))
-    turn = torch.stack([half.cos(), zero, zero, half.sin()], -1)
     position = torch.cat([nodes[:, :2], torch.full((len(nodes), 1), height)], -1)
-    return position, quaternion_multiply(turn, torch.tensor(rest).expand(len(nodes), 4))
+    return position, quaternion_multiply(quaternion_from_yaw(nodes[:, 2]), torch.tensor(rest).expand(len(nodes), 4))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dora.affordance.reach.feasibility_table import Grid
 from dora.geometry.poses import Pose
-from dora.geometry.rotations import quaternion_from_rotation_vector
+from dora.geometry.rotations import quaternion_from_yaw, yaw_of
 
 TRIES = 8
 """Starting poses that are drawn for an object that stands."""
@@ -34,9 +34,7 @@ def standing(u: Float[Tensor, "b d"], height: Float[Tensor, " b"], grid: Grid, r
     u = u.reshape(len(u), TRIES, 3)
     x, y = (c + w * (2 * u[..., k] - 1) for k, (c, w) in enumerate(zip(grid.centre, grid.spread, strict=True)))
     position = torch.stack([x, y, height[:, None].expand_as(x)], -1)
-    turn = torch.zeros_like(position)
-    turn[..., 2] = 2 * pi * u[..., 2]
-    quaternion = quaternion_from_rotation_vector(turn)
+    quaternion = quaternion_from_yaw(2 * pi * u[..., 2])
     able = reachable(position.flatten(0, 1), quaternion.flatten(0, 1)).any(-1).reshape(len(u), TRIES)
     chosen = torch.arange(len(u), device=u.device), able.float().argmax(-1)
     return position[chosen], quaternion[chosen]
@@ -79,7 +77,6 @@ def standing_starts(grid: Grid) -> ChosenStarts:
 
     def shares(u: Tensor, pose: Pose) -> Tensor:
         place = [(float(x) - n.low) / (n.high - n.low) for x, n in zip(pose[0], names, strict=False)]
-        yaw = 2 * torch.atan2(pose[1][3], pose[1][0])
-        return torch.tensor([*place, float(yaw / (2 * pi) % 1)]).clamp(0, 1)
+        return torch.tensor([*place, float(yaw_of(pose[1]) / (2 * pi) % 1)]).clamp(0, 1)
 
     return ChosenStarts(numbers, lambda chosen: chosen.repeat(TRIES), shares)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates
 from dora.geometry.poses import Pose, carried, compose, relative
-from dora.geometry.rotations import quaternion_apply, quaternion_from_rotation_vector, quaternion_multiply
+from dora.geometry.rotations import quaternion_apply, quaternion_from_yaw, quaternion_multiply, yaw_of
 from dora.robot.motion.inverse_kinematics import InverseKinematics
 from dora.tasks.env.arm import Arm
 
@@ -48,8 +48,7 @@ class OvenReach:
 
     def mask(self, oven_p: Float[Tensor, "b 3"], oven_q: Float[Tensor, "b 4"]) -> Bool[Tensor, "b c"]:
         """The same for microwaves at these world poses."""
-        yaw = 2 * torch.atan2(oven_q[:, 3], oven_q[:, 0])
-        place = torch.cat([oven_p[:, :2], yaw[:, None]], -1) / self.scale
+        place = torch.cat([oven_p[:, :2], yaw_of(oven_q)[:, None]], -1) / self.scale
         return self.followed[torch.cdist(place, self.nodes / self.scale).argmin(-1)]
 
 
@@ -69,9 +68,7 @@ def oven_reach(
     grid = torch.cartesian_prod(nodes(spread, PLACES), nodes(spread, PLACES), nodes(turn, YAWS))
     grid[:, :2] += torch.tensor(centre[:2])
     p = torch.cat([grid[:, :2], torch.full_like(grid[:, :1], centre[2])], -1)
-    spin = torch.zeros_like(p)
-    spin[:, 2] = grid[:, 2]
-    poses = way(candidates.to("cpu"), p, quaternion_from_rotation_vector(spin))
+    poses = way(candidates.to("cpu"), p, quaternion_from_yaw(grid[:, 2]))
     base_p, base_q = torch.tensor(arm.spec.position), torch.tensor(arm.spec.quaternion)
     kinematics = InverseKinematics(arm.agent.description, arm.posture.arm)
     count = len(p) * len(candidates)
@@ -99,9 +96,8 @@ def opening_way(hinge: Pose, handle: Pose, back: float, target: float) -> Way:
         """World wrist poses (m, c, 3) [m], (m, c, 4) wxyz before the handle and along the arc, as `Way`."""
 
         def at(angle: float) -> Pose:
-            spin = torch.tensor([0.0, 0.0, -angle]).expand(len(p), 3)
             door = compose((p, q), (hinge[0].expand(len(p), 3), hinge[1].expand(len(p), 4)))
-            door = door[0], quaternion_multiply(door[1], quaternion_from_rotation_vector(spin))
+            door = door[0], quaternion_multiply(door[1], quaternion_from_yaw(torch.full((len(p),), -angle)))
             return compose(door, (handle[0].expand(len(p), 3), handle[1].expand(len(p), 4)))
 
         shut = at(0.0)
@@ -127,9 +123,7 @@ def placing_way(front: float, depth: float, height: float) -> Way:
     def way(candidates: GraspCandidates, p: Tensor, q: Tensor) -> list[Pose]:
         """World wrist poses (m, c, 3) [m], (m, c, 4) wxyz from before the cavity into it, as `Way`."""
         fingers = quaternion_apply(candidates.quaternion, torch.tensor([0.0, 0.0, 1.0]).expand(len(candidates), 3))
-        spin = torch.zeros_like(fingers)
-        spin[:, 2] = -torch.atan2(fingers[:, 1], fingers[:, 0])
-        ahead = quaternion_from_rotation_vector(spin)
+        ahead = quaternion_from_yaw(-torch.atan2(fingers[:, 1], fingers[:, 0]))
         grasp = quaternion_apply(ahead, candidates.position), quaternion_multiply(ahead, candidates.quaternion)
         m, c = len(p), len(candidates)
         turn = q[:, None].expand(m, c, 4)

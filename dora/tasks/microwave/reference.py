@@ -17,6 +17,7 @@ from dora.geometry.poses import Pose, compose, relative
 from dora.geometry.rotations import (
     quaternion_apply,
     quaternion_from_rotation_vector,
+    quaternion_from_yaw,
     quaternion_multiply,
 )
 from dora.tasks.guidance.waypoints import Kept, Waypoint
@@ -201,6 +202,4 @@ def entry_turn(s: MicrowaveSnapshot, kept: Kept) -> Float[Tensor, "n 4"]:
     fingers = torch.tensor([0.0, 0.0, 1.0], device=s.oven_q.device).expand_as(s.oven_p)
     into, now = quaternion_apply(s.oven_q, ahead), quaternion_apply(kept.goal[1], fingers)
     yaw = torch.atan2(into[:, 1], into[:, 0]) - torch.atan2(now[:, 1], now[:, 0])
-    turn = torch.zeros_like(s.oven_p)
-    turn[:, 2] = torch.remainder(yaw + torch.pi, 2 * torch.pi) - torch.pi
-    return quaternion_from_rotation_vector(turn)
+    return quaternion_from_yaw(torch.remainder(yaw + torch.pi, 2 * torch.pi) - torch.pi)

@@ -17,7 +17,7 @@ from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.objects.articulation import Mount, load_mount
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.feasibility_table import Grid
-from dora.geometry.rotations import quaternion_from_rotation_vector
+from dora.geometry.rotations import quaternion_from_yaw
 from dora.robot import RobotDescription
 from dora.robot.shapes import Shape
 from dora.sim.actors import build_box
@@ -140,11 +140,9 @@ class MicrowaveTask(Task):
         oven = 2 * oven - 1
         position = torch.tensor(c.oven, device=scene.device).repeat(len(rows), 1)
         position[:, :2] += r.oven_position * oven[:, :2]
-        turn = torch.zeros_like(position)
-        turn[:, 2] = r.oven_rotation * oven[:, 2]
         resistance = torch.tensor([hinge.damping, hinge.friction, hinge.latch], device=scene.device)
         damping, friction, latch = (resistance * (1 + r.hinge * oven[:, 3:])).unbind(-1)
-        quaternion = quaternion_from_rotation_vector(turn)
+        quaternion = quaternion_from_yaw(r.oven_rotation * oven[:, 2])
         self.oven.begin(rows, position, quaternion, damping, friction, latch)
         grid, right = self.start_grid(RIGHT), scene.arms[RIGHT]
         assert grid is not None
