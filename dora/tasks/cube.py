@@ -197,16 +197,15 @@ def stages(c: CubeConfig) -> list[Stage[Snapshot]]:
         return _distance(s) > c.lost
 
     return [
-        Stage("reach", lambda s: tolerance(_distance(s), (0.0, c.reach), 0.25), lambda s: _distance(s) < c.reach),
+        Stage("reach", lambda s: _distance(s) < c.reach),
         Stage(
             "grasp",
-            lambda s: (s.hand.touch[:, 0].float() + s.hand.touch[:, 1:-1].any(-1)) / 2,
             opposed,
             hold=c.touch_time,
             lost=lost,
             back_to="reach",
         ),
-        Stage("lift", lambda s: rise(s, c.lift), lambda s: held(s, c), hold=c.hold_time, lost=lost, back_to="reach"),
+        Stage("lift", lambda s: held(s, c), hold=c.hold_time, lost=lost, back_to="reach"),
     ]
 
 

@@ -197,10 +197,9 @@ OBSERVATIONS: dict[str, Entry] = {
 def stages(c: JugConfig) -> list[Stage[Snapshot]]:
     """The sub-tasks, in order."""
     return [
-        Stage("reach", lambda s: tolerance(_to_handle(s), (0.0, c.reach), 0.25), lambda s: _to_handle(s) < c.reach),
+        Stage("reach", lambda s: _to_handle(s) < c.reach),
         Stage(
             "grasp",
-            lambda s: (s.hand.touch[:, 0].float() + s.hand.touch[:, 1:-1].any(-1) + by_the_handle(s).float()) / 3,
             lambda s: opposed(s) & by_the_handle(s),
             hold=c.touch_time,
             lost=lambda s: _to_handle(s) > c.lost,
@@ -208,7 +207,6 @@ def stages(c: JugConfig) -> list[Stage[Snapshot]]:
         ),
         Stage(
             "lift",
-            lambda s: rise(s, c.lift),
             lambda s: held(s, c) & by_the_handle(s),
             hold=c.hold_time,
             lost=lambda s: _to_jug(s) > c.let_go,

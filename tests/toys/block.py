@@ -21,7 +21,7 @@ from dora.tasks.mdp.quantities import lifted, off_table, opposed, rise, tips_in_
 from dora.tasks.mdp.rewards import Term, Terms
 from dora.tasks.mdp.snapshot import Snapshot
 from dora.tasks.mdp.stages import Stage
-from dora.tasks.mdp.terms import at_candidate, finger_contacts, near_region, paper_grasp, paper_penalty, penalties
+from dora.tasks.mdp.terms import at_candidate, near_region, paper_grasp, paper_penalty, penalties
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,8 +48,8 @@ class BlockTask(Task):
             return (lifted(s) > lift) & opposed(s)
 
         stages = [
-            Stage("grasp", finger_contacts, opposed, hold=0.15),
-            Stage("lift", lambda s: rise(s, lift), held, hold=0.5, lost=lambda s: ~opposed(s), back_to="grasp"),
+            Stage("grasp", opposed, hold=0.15),
+            Stage("lift", held, hold=0.5, lost=lambda s: ~opposed(s), back_to="grasp"),
         ]
         tips = Entry(lambda s: tips_in_object(s).flatten(1), "m", "fingertips in the block's frame", True)
         near: Term[Snapshot] = Term(lambda s: near_region(tips_in_object(s).norm(dim=-1)), 0.3, "affordance", True)

@@ -57,9 +57,9 @@ class PairTask(Task):
         def progress(s: Snapshot) -> Tensor:
             return torch.stack([rise(s.of(arm), LIFT) for arm in arms]).mean(0)
 
-        stages = [
-            Stage("grasp", progress, lambda s: opposed(s.of("left")) & opposed(s.of("right")), hold=0.15),
-            Stage("lift", progress, lambda s: held(s, "left") & held(s, "right"), hold=0.5),
+        stages: list[Stage[Snapshot]] = [
+            Stage("grasp", lambda s: opposed(s.of("left")) & opposed(s.of("right")), hold=0.15),
+            Stage("lift", lambda s: held(s, "left") & held(s, "right"), hold=0.5),
         ]
         raised: Term[Snapshot] = Term(progress, 3.0)
         near: dict[str, Term[Snapshot]] = {

@@ -72,17 +72,14 @@ def phases(c: GraspSettings) -> list[Stage[Tracking]]:
     def within(t: Tracking, limits: tuple[float, float]) -> Tensor:
         return (t.position < limits[0]) & (t.angle < limits[1])
 
-    def none(t: Tracking) -> Tensor:
-        return torch.zeros_like(t.position)
-
     def lost(t: Tracking) -> Tensor:
         return t.offset > c.lost
 
     return [
-        Stage("approach", none, lambda t: within(t, c.arrived)),
-        Stage("descend", none, lambda t: (t.standoff <= 0) & (within(t, c.settled) | t.impatient)),
-        Stage("close", none, lambda t: t.closing >= 1, hold=c.closed_time, lost=lost, back_to="approach"),
-        Stage("lift", none, lambda t: t.offset < 0, lost=lost, back_to="approach"),
+        Stage("approach", lambda t: within(t, c.arrived)),
+        Stage("descend", lambda t: (t.standoff <= 0) & (within(t, c.settled) | t.impatient)),
+        Stage("close", lambda t: t.closing >= 1, hold=c.closed_time, lost=lost, back_to="approach"),
+        Stage("lift", lambda t: t.offset < 0, lost=lost, back_to="approach"),
     ]
 
 

@@ -78,9 +78,6 @@ class _Progress:
 def _phase(waypoints: Sequence[Waypoint], k: int) -> Stage[_Progress]:
     """Waypoint k as a phase; the last one never ends."""
 
-    def none(t: _Progress) -> Tensor:
-        return torch.zeros(len(t.arrived), device=t.arrived.device)
-
     def arrived(t: _Progress) -> Tensor:
         return t.arrived[:, k] & (k < len(waypoints) - 1)
 
@@ -88,8 +85,8 @@ def _phase(waypoints: Sequence[Waypoint], k: int) -> Stage[_Progress]:
         return t.lost[:, k]
 
     if k == 0 or waypoints[k].lost is None:
-        return Stage(waypoints[k].name, none, arrived)
-    return Stage(waypoints[k].name, none, arrived, lost=lost, back_to=waypoints[0].name)
+        return Stage(waypoints[k].name, arrived)
+    return Stage(waypoints[k].name, arrived, lost=lost, back_to=waypoints[0].name)
 
 
 class WaypointReference(Reference):

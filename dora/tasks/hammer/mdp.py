@@ -48,10 +48,10 @@ def stages(c: "HammerConfig") -> list[Stage[HammerSnapshot]]:
         return s.nail_driven >= c.nail.driven
 
     return [
-        Stage("catch", lambda s: tolerance(off_centre(s), (0.0, 0.02), 0.3), caught, hold=c.caught_time),
-        Stage("stabilise", lambda s: steadiness(s, c), still, lost=lost, back_to="catch"),
-        Stage("orient", poise, oriented, hold=c.hold_time, lost=lost, back_to="catch"),
-        Stage("strike", lambda s: driven_share(s, c), driven, lost=lost, back_to="catch"),
+        Stage("catch", caught, hold=c.caught_time),
+        Stage("stabilise", still, lost=lost, back_to="catch"),
+        Stage("orient", oriented, hold=c.hold_time, lost=lost, back_to="catch"),
+        Stage("strike", driven, lost=lost, back_to="catch"),
     ]
 
 

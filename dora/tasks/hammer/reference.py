@@ -110,9 +110,6 @@ WAIT, CLOSE, SETTLE, ALIGN, RAISING, SWING, REST = range(7)
 def phases(c: CatchSettings) -> list[Stage[Timing]]:
     """The phases, in order."""
 
-    def none(t: Timing) -> Tensor:
-        return torch.zeros_like(t.spent)
-
     def there(t: Timing) -> Tensor:
         return ((t.position < c.arrived[0]) & (t.angle < c.arrived[1])) | (t.spent > c.patience)
 
@@ -120,13 +117,13 @@ def phases(c: CatchSettings) -> list[Stage[Timing]]:
         return t.spent >= c.swing_time + c.dwell
 
     return [
-        Stage("wait", none, lambda t: t.arrival <= c.lead),
-        Stage("close", none, lambda t: t.spent >= c.close_time),
-        Stage("settle", none, lambda t: t.spent >= c.settle_time),
-        Stage("align", none, lambda t: there(t) & (t.spent >= c.align_time), hold=c.aligned_time),
-        Stage("raise", none, there, hold=c.raised_time),
-        Stage("swing", none, lambda t: struck(t) & t.driven, lost=lambda t: struck(t) & ~t.driven, back_to="raise"),
-        Stage("rest", none, lambda t: t.spent < 0),
+        Stage("wait", lambda t: t.arrival <= c.lead),
+        Stage("close", lambda t: t.spent >= c.close_time),
+        Stage("settle", lambda t: t.spent >= c.settle_time),
+        Stage("align", lambda t: there(t) & (t.spent >= c.align_time), hold=c.aligned_time),
+        Stage("raise", there, hold=c.raised_time),
+        Stage("swing", lambda t: struck(t) & t.driven, lost=lambda t: struck(t) & ~t.driven, back_to="raise"),
+        Stage("rest", lambda t: t.spent < 0),
     ]
 
 

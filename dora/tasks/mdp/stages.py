@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 S = TypeVar("S")
@@ -17,18 +18,16 @@ class Stage(Generic[S]):
 
     Attributes:
         name: unique, snake_case; appears in logs as `stage/<name>`.
-        progress: snapshot -> (N,) in [0, 1], how near the stage is to done.
-        done: snapshot -> (N,) bool, the stage's own success test.
+        done: snapshot -> (n,) bool, the stage's own success test.
         hold: time for which `done` must stay true before the next stage starts [s]; at least one control step.
-        lost: snapshot -> (N,) bool, sends the environment back to `back_to`; None if nothing can be lost.
+        lost: snapshot -> (n,) bool, sends the environment back to `back_to`; None if nothing can be lost.
         back_to: name of an earlier stage.
     """
 
     name: str
-    progress: Callable[[S], Tensor]
-    done: Callable[[S], Tensor]
+    done: Callable[[S], Bool[Tensor, " n"]]
     hold: float = 0.0
-    lost: Callable[[S], Tensor] | None = None
+    lost: Callable[[S], Bool[Tensor, " n"]] | None = None
     back_to: str | None = None
 
 
@@ -57,7 +56,7 @@ class StageMachine(Generic[S]):
     def __len__(self) -> int:
         return len(self.stages)
 
-    def reset(self, env_idx: Tensor) -> None:
+    def reset(self, env_idx: Int[Tensor, " b"]) -> None:
         """Sends the environments in `env_idx` (b,) back to the first stage; the others keep theirs."""
         for buffer in (self.index, self.hold_count, self.furthest):
             buffer[env_idx] = 0
@@ -77,14 +76,8 @@ class StageMachine(Generic[S]):
         self.index.copy_(step)
         self.furthest.copy_(torch.maximum(self.furthest, step))
 
-    def score(self, s: S) -> Tensor:
-        """(N,) in [0, 1]: stages finished plus progress in the active one, over K."""
-        one = torch.ones_like(self.index, dtype=torch.float32)
-        progress = torch.stack([x.progress(s) for x in self.stages] + [0 * one]).clamp(0, 1)
-        return (self.index + progress.gather(0, self.index[None])[0]) / len(self)
-
     def get_state(self) -> dict[str, Tensor]:
-        """The machine's (N,) buffers by name."""
+        """The machine's (n,) buffers by name."""
         return {"stage": self.index.clone(), "hold_count": self.hold_count.clone(), "furthest": self.furthest.clone()}
 
     def set_state(self, state: dict[str, Tensor], env_idx: Tensor | slice) -> None:
@@ -93,16 +86,16 @@ class StageMachine(Generic[S]):
             buffer[env_idx] = state[name].reshape(-1).to(buffer.dtype)
 
     @property
-    def finished(self) -> Tensor:
-        """(N,) bool: all stages done."""
+    def finished(self) -> Bool[Tensor, " n"]:
+        """(n,) bool: all stages done."""
         return self.index == len(self)
 
-    def by_arm(self) -> dict[str, Tensor]:
+    def by_arm(self) -> dict[str, Int[Tensor, " n"]]:
         """Active stages by arm, of which this machine knows none."""
         return {}
 
     def report(self) -> dict[str, Tensor]:
-        """(N,) tensors for `info`: whether all stages are done, the active one, and which were completed so far."""
+        """(n,) tensors for `info`: whether all stages are done, the active one, and which were completed so far."""
         done = {f"stage/{stage.name}": self.furthest > k for k, stage in enumerate(self.stages)}
         return {"finished": self.finished, "stage": self.index.clone(), **done}
 
@@ -134,25 +127,25 @@ class ParallelStages:
         return len(self.stages)
 
     @property
-    def index(self) -> Tensor:
-        """(N,) number of stages that are done now, of all arms."""
+    def index(self) -> Int[Tensor, " n"]:
+        """(n,) number of stages that are done now, of all arms."""
         return torch.stack([machine.index for machine in self.machines.values()]).sum(0)
 
     @property
     def furthest(self) -> Tensor:
-        """(N,) the same, of those that have been done so far."""
+        """(n,) the same, of those that have been done so far."""
         return torch.stack([machine.furthest for machine in self.machines.values()]).sum(0)
 
     @property
-    def finished(self) -> Tensor:
-        """(N,) bool: all stages of all arms done."""
+    def finished(self) -> Bool[Tensor, " n"]:
+        """(n,) bool: all stages of all arms done."""
         return torch.stack([machine.finished for machine in self.machines.values()]).all(0)
 
-    def by_arm(self) -> dict[str, Tensor]:
-        """(N,) index of the active stage of each arm; the number of its stages when all are done."""
+    def by_arm(self) -> dict[str, Int[Tensor, " n"]]:
+        """(n,) index of the active stage of each arm; the number of its stages when all are done."""
         return {arm: machine.index.clone() for arm, machine in self.machines.items()}
 
-    def reset(self, env_idx: Tensor) -> None:
+    def reset(self, env_idx: Int[Tensor, " b"]) -> None:
         """As `StageMachine.reset`, for all arms."""
         for machine in self.machines.values():
             machine.reset(env_idx)
@@ -163,7 +156,7 @@ class ParallelStages:
             machine.advance(s.of(arm))
 
     def get_state(self) -> dict[str, Tensor]:
-        """The buffers (N,) of all machines, by arm and name."""
+        """The buffers (n,) of all machines, by arm and name."""
         return {f"{arm}.{k}": v for arm, machine in self.machines.items() for k, v in machine.get_state().items()}
 
     def set_state(self, state: dict[str, Tensor], env_idx: Tensor | slice) -> None:
@@ -173,7 +166,7 @@ class ParallelStages:
             machine.set_state(own, env_idx)
 
     def report(self) -> dict[str, Tensor]:
-        """(N,) tensors for `info`, as `StageMachine.report`."""
+        """(n,) tensors for `info`, as `StageMachine.report`."""
         done = {name: v for m in self.machines.values() for name, v in m.report().items() if name.startswith("stage/")}
         return {"finished": self.finished, "stage": self.index, **done}
 

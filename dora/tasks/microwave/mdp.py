@@ -180,9 +180,6 @@ def _before(s: MicrowaveSnapshot, c: MicrowaveConfig) -> Tensor:
 def stages(c: MicrowaveConfig) -> dict[str, list[Stage[MicrowaveSnapshot]]]:
     """The sub-tasks of each arm, which are done side by side."""
 
-    def near(s: MicrowaveSnapshot) -> Tensor:
-        return tolerance(to_region(s), (0.0, c.reach), 0.25)
-
     def reached(s: MicrowaveSnapshot) -> Tensor:
         return to_region(s) < c.reach
 
@@ -191,9 +188,6 @@ def stages(c: MicrowaveConfig) -> dict[str, list[Stage[MicrowaveSnapshot]]]:
 
     def dropped(s: MicrowaveSnapshot) -> Tensor:
         return lost(s) & ~inside(s)
-
-    def touching(s: MicrowaveSnapshot) -> Tensor:
-        return (s.hand.touch[:, 0].float() + s.hand.touch[:, 1:-1].any(-1)) / 2
 
     def opened(s: MicrowaveSnapshot) -> Tensor:
         return s.door >= c.open
@@ -204,16 +198,16 @@ def stages(c: MicrowaveConfig) -> dict[str, list[Stage[MicrowaveSnapshot]]]:
     hold = c.touch_time
     return {
         LEFT: [
-            Stage("reach_handle", near, reached),
-            Stage("grasp_handle", touching, opposed, hold=hold, lost=lost, back_to="reach_handle"),
-            Stage("open", lambda s: (s.door / c.open).clamp(0, 1), opened, lost=slipped, back_to="reach_handle"),
+            Stage("reach_handle", reached),
+            Stage("grasp_handle", opposed, hold=hold, lost=lost, back_to="reach_handle"),
+            Stage("open", opened, lost=slipped, back_to="reach_handle"),
         ],
         RIGHT: [
-            Stage("reach_cube", near, reached),
-            Stage("grasp_cube", touching, opposed, hold=hold, lost=lost, back_to="reach_cube"),
-            Stage("carry", lambda s: _before(s, c), lambda s: before_cavity(s, c), lost=lost, back_to="reach_cube"),
-            Stage("put_in", lambda s: _depth(s, c), inside, lost=dropped, back_to="reach_cube"),
-            Stage("leave", lambda s: hands_out(s).float(), lambda s: at_rest(s, c), hold=c.rest_time),
+            Stage("reach_cube", reached),
+            Stage("grasp_cube", opposed, hold=hold, lost=lost, back_to="reach_cube"),
+            Stage("carry", lambda s: before_cavity(s, c), lost=lost, back_to="reach_cube"),
+            Stage("put_in", inside, lost=dropped, back_to="reach_cube"),
+            Stage("leave", lambda s: at_rest(s, c), hold=c.rest_time),
         ],
     }
 
