@@ -106,5 +106,12 @@ def command(body: Callable[P, int | None]) -> Callable[P, int]:
         except RunFailure as error:
             print(error, file=sys.stderr)
             return FAILED
+        except BrokenPipeError:
+            raise  # of the reader of what is printed
+        except OSError as error:
+            if error.filename is None:
+                raise
+            print(one_line(f"{error.filename!r} cannot be used: {error.strerror}."), file=sys.stderr)
+            return BAD_INPUT
 
     return run

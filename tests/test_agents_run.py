@@ -17,7 +17,7 @@ from fake_task import PointMass
 
 import dora.agents
 from dora.agents.checkpoint import read_checkpoint
-from dora.agents.config import LEARNER_CONFIGS, NEUTRAL, NEUTRAL_LEARNER, config_from_dict, stored_digests
+from dora.agents.config import LEARNER_CONFIGS, NEUTRAL, NEUTRAL_LEARNER, UNUSED, config_from_dict, stored_digests
 from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed
 from dora.agents.evaluation.play import load_policy
 from dora.agents.runs.recommended import learners_of, recommended
@@ -292,7 +292,7 @@ def test_the_reward_of_the_paper_trains(script: ModuleType, tmp_path: Path, monk
 def test_settings_without_a_reward_mean_the_dense_one_and_keep_their_digest():
     config = run.parse(["--env", "DoraCube-v1"]).run
     content = copy.deepcopy(plain(config))
-    assert content.pop("reward") == "dense"
+    assert {name: content.pop(name) for name in UNUSED} == UNUSED
     assert config_from_dict(content) == config
     del content["total_steps"]
     whole = digest_of(content)[:12]

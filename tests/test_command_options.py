@@ -60,9 +60,8 @@ def test_every_number_of_a_run_has_a_range():
     from dora.agents.limits import RUN as RANGES
 
     own = RunConfig("x", "ppo")
-    assert {n for n, v in vars(own).items() if type(v) in (int, float)} - {"stop_success"} == set(RANGES) - {
-        "stop_success"
-    }
+    optional = {"stop_success", "after_success"}
+    assert {n for n, v in vars(own).items() if type(v) in (int, float)} - optional == set(RANGES) - optional
     for cls in LEARNER_CONFIGS.values():
         assert {n for n, v in vars(cls()).items() if type(v) in (int, float)} <= set(LEARNER)
 
@@ -163,6 +162,8 @@ def test_searches(words: str, message: str, monkeypatch: pytest.MonkeyPatch, cap
         ("bench", f"env --workers {HUGE}", "--workers"),
         ("bench", "env --env PickCub-v1", "did you mean 'PickCube-v1'"),
         ("bench", "page --seconds 0", "--seconds is 0"),
+        ("bench", "learner --seconds 0", "--seconds is 0"),
+        ("bench", "learner --seconds nan", "--seconds is nan"),
         ("bench", "page DoraCub-v1", "did you mean 'DoraCube-v1'"),
         ("bench", "grasp --object cub", "did you mean 'cube'"),
         ("bench", "grasp --robot nothing", "unknown robot"),

@@ -199,10 +199,14 @@ def test_last_states_are_written_to_few_files(folder: Path, monkeypatch: pytest.
         assert not np.isfinite(record["states"][-1]).all()
         assert record["actions"].shape == (k - 1, 8)
         assert (record["actions"][:-1] == 0.25).all()
+    others = [folder / f"expert-{number:02d}.npz" for number in range(20)]
+    for path in others:
+        path.write_bytes(b"of the user")
     for number in range(2 * records.MOST_IN_FOLDER):
         monkeypatch.setattr(records, "_numbers", iter([1000 + number]))
         records.StateRecorder().write(records.Record(0, [b""], [b""], [], []))
-    assert len(list(folder.iterdir())) == records.MOST_IN_FOLDER
+    assert all(path.exists() for path in others)
+    assert len(list(folder.iterdir())) == records.MOST_IN_FOLDER + len(others)
     env.close()
 
 

@@ -10,7 +10,7 @@ import tyro
 from dora.agents.learners import benchmark as learner_benchmark
 from dora.agents.runs.recommended import recommended
 from dora.commands import play
-from dora.errors import command
+from dora.errors import InputError, command
 from dora.live import page_rate
 from dora.parallel import available_cores
 from dora.progress import ProgressDisplay
@@ -20,6 +20,9 @@ from dora.tasks import check_task_id, find_task, make_task
 from dora.tools import env_benchmark as benchmark
 from dora.tools import grasp_benchmark
 from dora.tools import physics_benchmark as task_physics
+
+LONGEST = 86_400.0
+"""Longest time of a measurement of learners [s]."""
 
 
 def bench_env(
@@ -63,6 +66,8 @@ def bench_learner(env: str = "DoraCube-v1", agent: str = "ppo", seconds: float =
         seconds: length of each of the six measurements [s].
         json: print one JSON object on the last line instead of a table.
     """
+    if not 0 < seconds <= LONGEST:
+        raise InputError(f"--seconds is {seconds:g}: give a time above 0 and up to {LONGEST:g} seconds.")
     config = recommended(env, agent, find_task(env).LEARNERS)
     task = make_task(env, 1)
     observation = sum(entry.value(task.snapshot).shape[-1] for entry in task.observation_entries.values())

@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ MOST = 4
 """Files that one scene writes at most [1]."""
 MOST_IN_FOLDER = 16
 """Files in the folder at most [1]; the oldest are removed."""
+OURS = re.compile(r"\d+-\d+\.npz")
+"""Names of these files, `<process>-<number>.npz`; whatever else is in the folder stays."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,7 @@ def _next_number() -> int:
 
 
 def _remove_oldest(folder: Path) -> None:
-    files = sorted(folder.glob("*-*.npz"), key=lambda path: path.stat().st_mtime)
+    ours = (path for path in folder.glob("*-*.npz") if OURS.fullmatch(path.name))
+    files = sorted(ours, key=lambda path: path.stat().st_mtime)
     for path in files[:-MOST_IN_FOLDER]:
         path.unlink(missing_ok=True)

@@ -56,8 +56,7 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Any, sim_config: An
     """
     randomisation = find_preset(preset, cls.PRESETS)
     base: TaskConfig = replace(cls(), randomisation=randomisation, **cls.BY_PRESET.get(preset, {}))
-    rates = {ours: sim_config[theirs] for theirs, ours in SIM_RATES.items() if theirs in (sim_config or {})}
-    config = overridden(overridden(base, changes or {}, "config"), rates, "sim_config")
+    config = _with_rates(overridden(base, changes or {}, "config"), sim_config)
     check_finite(config, "config")
     check_not_negative(config, "config")
     check_not_negative(config.residual, "config.residual")
@@ -76,6 +75,16 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Any, sim_config: An
             f"config.control_frequency, {config.control_frequency} Hz."
         )
     return config
+
+
+def _with_rates(config: TaskConfig, sim_config: Any) -> TaskConfig:
+    """The numbers with the rates of a `sim_config`; one that makes no sense is left to ManiSkill's own keywords, which
+    refuse it."""
+    given = sim_config if isinstance(sim_config, Mapping) else {}
+    rates = {ours: given[theirs] for theirs, ours in SIM_RATES.items() if type(given.get(theirs)) is int}
+    changed = replace(config, **rates)
+    sound = changed.control_frequency > 0 and changed.physics_frequency % changed.control_frequency == 0
+    return changed if sound and changed.physics_frequency > 0 else config
 
 
 def check_options(

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dora.errors import InputError
 from dora.tasks.mdp.guidance_parts import REWARD, exists
 
 S = TypeVar("S")
@@ -47,7 +48,8 @@ class Terms(Generic[S]):
     """Weighted sum of named terms; knows its own bounds, so normalising needs no hand-typed maximum.
 
     Raises:
-        ValueError: if there is no term, or the sign of a weight contradicts the term's part.
+        ValueError: if there is no term.
+        InputError: the sign of a weight contradicts the term's part.
     """
 
     def __init__(self, terms: Mapping[str, Term[S]]):
@@ -55,7 +57,10 @@ class Terms(Generic[S]):
             raise ValueError("a reward needs at least one term")
         for name, term in terms.items():
             if term.weight > 0 if term.part == "penalty" else term.weight < 0:
-                raise ValueError(f"term {name!r} of part {term.part!r} cannot have the weight {term.weight}")
+                wrong = "above" if term.part == "penalty" else "below"
+                raise InputError(
+                    f"the weight of the {term.part} term {name!r} is {term.weight}; it cannot be {wrong} 0."
+                )
         self.terms = dict(terms)
         self.lower = sum(min(t.weight, 0.0) for t in self.terms.values())
         self.upper = sum(max(t.weight, 0.0) for t in self.terms.values())
