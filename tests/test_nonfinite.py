@@ -187,6 +187,7 @@ def test_last_states_are_written_to_few_files(folder: Path, monkeypatch: pytest.
         spoil(env, "velocity is NaN")
     files = sorted(folder.iterdir())
     assert len(files) == records.MOST
+    said = [line for line in said if "episode ended" in line]  # not of a driver that is missing
     assert len(said) == 1
     assert str(files[0]) in said[0]
     assert "environment 1" in said[0]

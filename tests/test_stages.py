@@ -153,7 +153,7 @@ def test_bad_tables_are_refused():
         StageMachine([Stage("a", value, lost=value)], 1, DT)
     with pytest.raises(ValueError, match="at least one term"):
         Terms({})
-    with pytest.raises(InputError, match="penalty term 'a' is 1.0; it cannot be above 0"):
+    with pytest.raises(InputError, match=r"penalty term 'a' is 1.0; it cannot be above 0"):
         Terms({"a": Term(value, 1.0, "penalty")})
     with pytest.raises(ValueError, match="task"):
         Terms({"a": Term(value, -1.0)})
