@@ -9,6 +9,7 @@ import tomllib
 from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
+from typing import Literal
 
 import coal
 import numpy as np
@@ -275,6 +276,19 @@ def test_a_cylinder_with_two_equal_spheres_becomes_a_capsule():
         "sphere",
         "sphere",
     ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "volume"),
+    [
+        ("box", (0.1, 0.2, 0.3), 0.048),
+        ("sphere", (0.1,), 4.18879e-3),
+        ("cylinder", (0.1, 0.2), 1.256637e-2),
+        ("capsule", (0.1, 0.2), 1.675516e-2),
+    ],
+)
+def test_primitives_have_a_volume(kind: Literal["box", "sphere", "cylinder", "capsule"], size: tuple, volume: float):
+    assert Shape(kind, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), size).volume == pytest.approx(volume, rel=1e-5)
 
 
 def test_robots_are_found_in_further_folders(folder, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -31,6 +32,17 @@ class Shape:
     position: tuple[float, float, float]
     quaternion: tuple[float, float, float, float]
     size: tuple[float, ...]
+
+    @property
+    def volume(self) -> float:
+        """[m^3]."""
+        if self.kind == "box":
+            return 8 * math.prod(self.size)
+        radius = self.size[0]
+        ball = 4 / 3 * math.pi * radius**3
+        if self.kind == "sphere":
+            return ball
+        return 2 * math.pi * radius**2 * self.size[1] + (ball if self.kind == "capsule" else 0.0)
 
     @property
     def segment(self) -> np.ndarray:

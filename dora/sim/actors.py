@@ -15,6 +15,7 @@ from sapien import physx
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.palette import PALETTE, colours
 from dora.errors import InputError
+from dora.sim.bodies import merged
 from dora.sim.shapes import collision_shape
 
 CONTACT_OFFSET = 0.005
@@ -154,10 +155,8 @@ def build_object(
         if shared:
             return builder.build(name)
         builder.set_scene_idxs([i])
-        part = builder.build(f"{name}-{i}")
-        scene.remove_from_state_dict_registry(part)
-        parts.append(part)
-    return _merged(scene, parts, name)
+        parts.append(builder.build(f"{name}-{i}"))
+    return merged(scene, parts, Actor, name)
 
 
 def build_box(
@@ -189,12 +188,4 @@ def build_box(
         builder.set_scene_idxs([i])
         builder.initial_pose = Pose.create(pose)
         parts.append(builder.build(f"{obj.name}-{i}"))
-        scene.remove_from_state_dict_registry(parts[-1])
-    return _merged(scene, parts, obj.name)
-
-
-def _merged(scene: ManiSkillScene, parts: Sequence[Actor], name: str) -> Actor:
-    """One actor of those built for each environment, saved and restored under `name`."""
-    merged = Actor.merge(list(parts), name)
-    scene.add_to_state_dict_registry(merged)
-    return merged
+    return merged(scene, parts, Actor, obj.name)

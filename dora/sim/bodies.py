@@ -1,18 +1,39 @@
-"""Poses and velocities of chosen bodies in one tensor, on every backend."""
+"""Poses and velocities of chosen bodies in one tensor, on every backend; one body of those of all environments."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
 from mani_skill.envs.scene import ManiSkillScene
-from mani_skill.utils.structs import Actor, Link
+from mani_skill.utils.structs import Actor, Articulation, Link
 from torch import Tensor
 
 POSE = slice(0, 7)
 """Columns of position and quaternion in the rigid-body buffer."""
 VELOCITY = slice(7, 13)
 """Columns of linear and angular velocity in the rigid-body buffer."""
+
+B = TypeVar("B", Actor, Articulation)
+"""An actor or an articulation."""
+
+
+def merged(scene: ManiSkillScene, parts: Sequence[B], kind: type[B], name: str) -> B:
+    """One body of those that were built for each environment, saved and restored under its name only.
+
+    Args:
+        scene: the ManiSkill scene of the bodies.
+        parts: one for each environment, in their order.
+        kind: of the bodies; the links and joints of articulations are merged as well.
+        name: of the whole.
+    """
+    for part in parts:
+        scene.remove_from_state_dict_registry(part)
+    links: dict[str, bool] = {"merge_links": True} if kind is Articulation else {}
+    merge: Any = kind.merge
+    whole = merge(list(parts), name=name, **links)
+    scene.add_to_state_dict_registry(whole)
+    return whole
 
 
 class BodyReader:

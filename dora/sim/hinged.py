@@ -9,7 +9,7 @@ with the angular velocity w; damping is the joint's own.
 """
 
 from collections.abc import Mapping
-from math import prod, tanh
+from math import tanh
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from torch import Tensor
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.articulation import Mount, MountLink
 from dora.robot.shapes import Shape
+from dora.sim.bodies import merged
 from dora.sim.shapes import DrawnShape, draw
 from dora.sim.substeps import watch_physics
 
@@ -140,7 +141,7 @@ def _build(scene: ManiSkillScene, obj: AffordanceObject, mount: Mount) -> Articu
             one.set_name(link.name)
             _join(one, link)
             shapes = _object_shapes(obj) if link.object else [s.primitive for s in link.shapes]
-            density = link.mass / sum(map(_volume, shapes))
+            density = link.mass / sum(shape.volume for shape in shapes)
             for shape in shapes:
                 _collide(one, shape, link.friction, density)
             if scene.can_render():
@@ -148,13 +149,10 @@ def _build(scene: ManiSkillScene, obj: AffordanceObject, mount: Mount) -> Articu
         builder.initial_pose = sapien.Pose([0.0, 0.0, 1.0])
         builder.set_scene_idxs([i])
         parts.append(builder.build(f"{obj.name}-{i}", fix_root_link=True))
-    for part in parts:
-        scene.remove_from_state_dict_registry(part)
-    merged = Articulation.merge(parts, name=obj.name, merge_links=True)
-    scene.add_to_state_dict_registry(merged)
-    for link in merged.links:
+    whole = merged(scene, parts, Articulation, obj.name)
+    for link in whole.links:
         link.disable_gravity = True
-    return merged
+    return whole
 
 
 def _join(builder: Any, link: MountLink) -> None:
@@ -184,14 +182,3 @@ def _collide(builder: Any, shape: Shape, friction: float, density: float) -> Non
     size = [list(shape.size)] if shape.kind == "box" else shape.size
     pose = sapien.Pose(shape.position, shape.quaternion)
     getattr(builder, f"add_{shape.kind}_collision")(pose, *size, material, density=density)
-
-
-def _volume(shape: Shape) -> float:
-    """Volume of a primitive [m^3]."""
-    if shape.kind == "box":
-        return 8 * prod(shape.size)
-    radius = shape.size[0]
-    ball = 4 / 3 * np.pi * radius**3
-    if shape.kind == "sphere":
-        return ball
-    return 2 * np.pi * radius**2 * shape.size[1] + (ball if shape.kind == "capsule" else 0.0)

@@ -17,6 +17,7 @@ from dora.geometry.poses import Pose, compose
 from dora.geometry.rotations import quaternion_apply, quaternion_from_matrix, quaternion_multiply
 from dora.robot import RobotDescription
 from dora.robot.kinematics import SerialChain
+from dora.sim.bodies import merged
 from dora.sim.controllers import CoupledJointPosConfig, WristHandConfig, WristHandController
 
 CONTROL_MODES = ("wrist_delta_hand_pos", "pd_joint_pos", "pd_joint_delta_pos")
@@ -72,10 +73,7 @@ class DescribedRobot(BaseAgent):
         name = self.uid if self._agent_idx is None else f"{self.uid}-agent-{self._agent_idx}"
         if self.build_separate:
             parts = [self._build(f"{name}-{i}", initial_pose, [i]) for i in range(self.scene.num_envs)]
-            for part in parts:
-                self.scene.remove_from_state_dict_registry(part)
-            self.robot = Articulation.merge(parts, name=name, merge_links=True)
-            self.scene.add_to_state_dict_registry(self.robot)
+            self.robot = merged(self.scene, parts, Articulation, name)
         else:
             self.robot = self._build(name, initial_pose)
         self.robot_link_names = [link.name for link in self.robot.get_links()]

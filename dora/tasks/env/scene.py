@@ -80,14 +80,6 @@ class TaskScene:
         offset = self.config.contact_offset
         return build_object(self.scene, load_object(name), scale=scale, contact_offset=offset, **settings)
 
-    def merged(self, actors: Sequence[Actor], name: str) -> Actor:
-        """One actor of those built for each environment, saved and restored under `name`."""
-        for actor in actors:
-            self.scene.remove_from_state_dict_registry(actor)
-        merged = Actor.merge(list(actors), name)
-        self.scene.add_to_state_dict_registry(merged)
-        return merged
-
     def add(self, name: str, actor: Actor | Link) -> None:
         """Takes a built object in: a body of its own, or a link of what it is mounted on."""
         half = torch.as_tensor(load_object(name).mesh.extents / 2, dtype=torch.float32, device=self.device)
