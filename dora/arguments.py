@@ -12,6 +12,8 @@ from dora.errors import InputError
 
 SEEDS = 2**32
 """Number of seeds that numpy's generators take [1]: 0 and up."""
+LARGEST_SEED = 2**31 - 1
+"""Largest seed that commands take [1]."""
 
 
 def as_tensor(value: Any, what: str, device: torch.device | str | None = None) -> Tensor:

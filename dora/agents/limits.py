@@ -1,6 +1,7 @@
 """Ranges of the settings of runs and learners, and the check that a run's are within them."""
 
 from dora.agents.config import RunConfig
+from dora.arguments import LARGEST_SEED
 from dora.configs import check_finite, check_ranges
 from dora.errors import InputError
 
@@ -9,7 +10,7 @@ MOST_TRANSITIONS = 100_000_000
 MOST_LAYERS, WIDEST = 16, 4096
 """Largest number of hidden layers, and of their units [1]."""
 RUN = {
-    "seed": (0, 2**31 - 1),
+    "seed": (0, LARGEST_SEED),
     "total_steps": (1, 10**12),
     "num_envs": (1, 100_000),
     "workers": (0, 512),

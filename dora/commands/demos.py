@@ -16,14 +16,15 @@ from typing import Annotated, Literal
 import torch
 import tyro
 
+from dora.arguments import LARGEST_SEED
 from dora.configs import check_ranges
 from dora.datasets.episodes import Plan
-from dora.datasets.record import LAST_SEED, check_possible, record_dataset
+from dora.datasets.record import check_possible, record_dataset
 from dora.datasets.sources import find_source
 from dora.errors import command
 from dora.progress import ProgressDisplay
 
-RANGES = {"episodes": (1, 1_000_000), "seed": (0, LAST_SEED), "num_envs": (1, 1024)}
+RANGES = {"episodes": (1, 1_000_000), "seed": (0, LARGEST_SEED), "num_envs": (1, 1024)}
 """Lowest and highest value of options."""
 
 

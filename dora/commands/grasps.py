@@ -22,6 +22,7 @@ from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.importing import import_mesh, size_in_words
 from dora.affordance.search.backends import Kinematics
 from dora.affordance.search.optimise import Settings
+from dora.arguments import LARGEST_SEED
 from dora.configs import check_ranges
 from dora.errors import InputError, command
 from dora.progress import ProgressDisplay
@@ -37,7 +38,7 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 RANGES = {
     "num": (1, 100_000),
-    "seed": (0, 2**31 - 1),
+    "seed": (0, LARGEST_SEED),
     "baselines": (0, 100_000),
     "by_region": (0, 100_000),
     "scale": (1e-9, 1e9),

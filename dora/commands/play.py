@@ -21,13 +21,14 @@ import torch
 import tyro
 
 from dora.agents.evaluation.play import record
+from dora.arguments import LARGEST_SEED
 from dora.configs import check_ranges
 from dora.errors import InputError, command
 from dora.files import make_folder
 from dora.live.page import Page
 from dora.live.players import Player, recorded, zero_correction
 from dora.live.recordings import Recording
-from dora.live.session import LARGEST_SEED, Session
+from dora.live.session import Session
 from dora.policies.policy import bundled_ids, load_policy
 from dora.sim.batch.rendering import can_render
 from dora.tasks import check_task_id, make_task

@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 from mani_skill.utils.wrappers.record import RecordEpisode
 
+from dora.arguments import LARGEST_SEED
 from dora.datasets.episodes import Episode, Plan, Source, make_batch, roll_out
 from dora.datasets.facts import Facts, facts_of
 from dora.datasets.lerobot import write_lerobot
@@ -27,8 +28,6 @@ FORMATS = ("lerobot", "minari", "maniskill")
 """Formats of datasets."""
 OWN = "recording.json"
 """File of a dataset that says how it was made, and lists seed, length and success of its episodes."""
-LAST_SEED = 2**31 - 1
-"""Largest seed of a start."""
 
 
 @dataclass
@@ -56,8 +55,9 @@ def check_possible(kind: str, plan: Plan, folder: Path, pictures: bool) -> None:
         raise InputError(f"there is no format {kind!r}: choose one of {', '.join(FORMATS)}.")
     if plan.episodes < 1 or plan.num_envs < 1:
         raise InputError(f"a dataset needs an episode in an environment, not {plan.episodes} in {plan.num_envs}.")
-    if not 0 <= plan.seed <= LAST_SEED - 100 * plan.episodes:
-        raise InputError(f"the seed of the first start is {plan.seed}; those of all have to be from 0 to {LAST_SEED}.")
+    if not 0 <= plan.seed <= LARGEST_SEED - 100 * plan.episodes:
+        first = f"the seed of the first start is {plan.seed}"
+        raise InputError(f"{first}; those of all have to be from 0 to {LARGEST_SEED}.")
     if os.path.lexists(folder):
         raise InputError(f"{folder} exists already: choose another folder, or remove it.")
     if kind == "lerobot":

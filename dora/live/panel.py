@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from dora.arguments import LARGEST_SEED
 from dora.live.orders import Choose, Order, Play, Push, Randomise, Repeat, Reset, Run, Speed, Start, Step
-from dora.live.session import LARGEST_SEED
 from dora.live.state import LiveState
 from dora.tasks.mdp.randomisation import PRESETS
 

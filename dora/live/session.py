@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from dora.arguments import LARGEST_SEED
 from dora.errors import InputError
 from dora.live.live_task import Beginning, LiveTask
 from dora.live.orders import Choose, Order, Play, Push, Randomise, Repeat, Reset, Run, Speed, Start, Step
@@ -33,8 +34,6 @@ SMOOTH = 0.1
 """Share of the newest step in the rate that is told [1]."""
 MOST_STEPS = 100_000
 """Largest number of control steps of one order."""
-LARGEST_SEED = 2**31 - 1
-"""Largest seed."""
 
 
 class Session:
