@@ -145,7 +145,8 @@ def test_every_environment_has_a_door_of_its_own():
 
 
 def test_an_object_without_a_mount_is_refused_in_words():
-    with pytest.raises(InputError, match=f"the object 'cube' is not mounted on anything: .* no {ARTICULATION_FILE}"):
+    message = f"the object 'cube' is not mounted on anything: .* no {ARTICULATION_FILE}: write one"
+    with pytest.raises(InputError, match=message):
         load_mount(load_object("cube"))
 
 

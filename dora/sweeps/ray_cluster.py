@@ -58,7 +58,9 @@ class RayLauncher(Launcher):
             self._ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
         except (ConnectionError, ValueError, RuntimeError) as error:
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
-            raise InputError(f"No Ray cluster answers at {address or 'this machine'} ({reason}).") from error
+            start = "start one by `ray start --head`, or correct --address (RAY_ADDRESS)"
+            where = address or "this machine"
+            raise InputError(f"No Ray cluster answers at {where} ({reason}): {start}.") from error
         nodes = [node["Resources"].get("CPU", 0) for node in self._ray.nodes() if node["Alive"]]
         self.room = sum(int(cpus // cores) for cpus in nodes)
         if self.room == 0:

@@ -21,7 +21,7 @@ from dora.affordance.reach.approach_paths import OK, REASONS
 from dora.errors import InputError, command
 from dora.progress import ProgressDisplay
 from dora.tables import text_table
-from dora.tasks import make_task
+from dora.tasks import check_task_id, find_task, make_task, task_ids
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.mdp.guidance_parts import FILTER, PARTS
 
@@ -87,16 +87,24 @@ def _reasons(task: DoraEnv) -> Int[Tensor, "n c"]:
     return table.reason[node].long()
 
 
+def tabulated_ids() -> list[str]:
+    """Ids of the tasks of one arm with a table of f_reach: their object stands on the table at the start."""
+    tasks = {env_id: find_task(env_id) for env_id in task_ids()}
+    alone = {env_id: task for env_id, task in tasks.items() if len(task.ARMS) == 1}
+    return [env_id for env_id, task in alone.items() if task(task.CONFIG()).start_grid(*task.ARMS) is not None]
+
+
 def outcomes(env_id: str, episodes: int, preset: str, choice: Choice) -> Outcomes:
     """Runs episodes with zero correction and without the filter.
 
     Raises:
-        InputError: the task has no table of f_reach.
+        InputError: there is no such task, or it has several arms or no table of f_reach.
     """
     parts = tuple(part for part in PARTS if part != FILTER)
+    check_task_id(env_id)
+    if env_id not in (able := tabulated_ids()):
+        raise InputError(f"{env_id} is no task of one arm with a table of f_reach: choose one of {', '.join(able)}.")
     task = make_task(env_id, BATCH, preset=preset, guidance_parts=parts)
-    if task.arm.reach_table is None:
-        raise InputError(f"{env_id} has no table of f_reach: its object does not stand on a table.")
     task.narrow = {task.arm.name: _Drawn(task)} if choice == "random" else {}
     reasons, won = [], []
     with ProgressDisplay() as phases:

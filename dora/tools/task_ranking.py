@@ -248,10 +248,12 @@ def rank_bundled_set(
     obj = load_object(name)
     ids = tasks_of(obj)
     if not ids:
-        raise InputError(f"no task uses the object {str(name)!r}, so its grasps cannot be ranked in one.")
+        why = f"no task uses the object {str(name)!r}, so its grasps cannot be ranked in one"
+        raise InputError(f"{why}: leave --rank-in-task out.")
     arms = find_task(ids[0]).ARMS
     if len(arms) > 1 and not region:
-        raise InputError(f"{ids[0]} has several arms, where grasps are ranked by success alone: leave any-region out.")
+        why = f"{ids[0]} has several arms, where grasps are ranked by success alone"
+        raise InputError(f"{why}: leave --any-region out.")
     objects = {arm: obj if spec.object == obj.name else load_object(spec.object) for arm, spec in arms.items()}
     found = {arm: load_candidates(name if o is obj else o.name, region=region) for arm, o in objects.items()}
     wanted = {

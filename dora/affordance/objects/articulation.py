@@ -142,7 +142,8 @@ def load_mount(obj: AffordanceObject) -> Mount:
         InputError: the folder says nothing of it, or its file is damaged or does not fit.
     """
     if obj.folder is None or not (obj.folder / ARTICULATION_FILE).is_file():
-        raise InputError(f"the object {obj.name!r} is not mounted on anything: its folder has no {ARTICULATION_FILE}.")
+        why = f"the object {obj.name!r} is not mounted on anything: its folder has no {ARTICULATION_FILE}"
+        raise InputError(f"{why}: write one, or choose an object that has one.")
     path = obj.folder / ARTICULATION_FILE
     return _read(path, path.stat().st_mtime_ns)
 
@@ -152,7 +153,8 @@ def _read(path: Path, time: int) -> Mount:
     """The mount of a file as it was at a time of its last change."""
     content = read_toml(path, "file about what an object is mounted on")
     if content.get("format") != FORMAT:
-        raise InputError(f"{path}: the format is {shown(content.get('format'))}, not {FORMAT!r}.")
+        found = shown(content.get("format"))
+        raise InputError(f"{path}: the format is {found}, not {FORMAT!r}: write the file again.")
     values = {name: value for name, value in content.items() if name != "format"}
     mount = built(Mount, values, str(path))
     try:
@@ -166,21 +168,22 @@ def _check(mount: Mount) -> None:
     """Refuses links that cannot be built; the message does not name the file."""
     names = [link.name for link in mount.links]
     if not 2 <= len(names) <= MOST_LINKS:
-        raise InputError(f"there are {len(names)} links; there must be 2 to {MOST_LINKS}.")
+        raise InputError(f"there are {len(names)} links: write 2 to {MOST_LINKS}.")
     if sum(link.hinge is not None for link in mount.links) != 1 or sum(link.object for link in mount.links) != 1:
-        raise InputError("exactly one link must have a hinge, and one must be the object.")
+        raise InputError("exactly one link must have a hinge, and one must be the object: correct the links.")
     for k, link in enumerate(mount.links):
         where = f"link {shown(link.name)}"
         if not link.name or names.count(link.name) > 1:
-            raise InputError(f"{where} needs a name of its own.")
+            raise InputError(f"{where} needs a name of its own: rename it.")
         if (k == 0) != (link.parent == "") or (k and link.parent not in names[:k]):
-            raise InputError(f"{where} must have an earlier link as its parent, and the first link none.")
+            raise InputError(f"{where} must have an earlier link as its parent, and the first link none: correct it.")
         if k == 0 and (link.hinge or link.object):
-            raise InputError(f"{where} is fixed in the world: it can neither have a hinge nor be the object.")
+            raise InputError(f"{where} is fixed in the world: leave its hinge out, and let another one be the object.")
         if link.object == bool(link.shapes) or len(link.shapes) > MOST_SHAPES:
-            raise InputError(f"{where} must have 1 to {MOST_SHAPES} shapes, and none if it is the object.")
+            shapes = f"1 to {MOST_SHAPES} shapes, and none if it is the object"
+            raise InputError(f"{where} has {len(link.shapes)} shapes: give it {shapes}.")
         if link.object and link.parent != mount.hinge_link.name:
-            raise InputError(f"{where} is the object: it must be fixed to the link with the hinge.")
+            raise InputError(f"{where} is the object: make the link with the hinge its parent.")
         _check_numbers(link, where)
 
 
@@ -191,7 +194,7 @@ def _check_numbers(link: MountLink, where: str) -> None:
         if SIZES.get(shape.shape) != len(shape.size):
             raise InputError(f"{where} has a shape {shown(shape.shape)} with {len(shape.size)} sizes: correct it.")
         if min(shape.size) <= 0:
-            raise InputError(f"{where} has a shape whose size is not positive.")
+            raise InputError(f"{where} has a shape whose size is not positive: make it larger.")
         numbers += [*shape.position, *shape.size, *(shape.colour or ())]
         turns.append(shape.quaternion)
     if link.hinge is not None:
@@ -199,10 +202,11 @@ def _check_numbers(link: MountLink, where: str) -> None:
         numbers += [*h.limits, h.damping, h.friction, h.latch, h.latch_angle]
         turns.append((*h.axis, 0.0))
         if h.limits[0] >= h.limits[1] or min(h.damping, h.friction, h.latch) < 0:
-            raise InputError(f"{where} has a hinge whose limits are not ordered, or whose resistance is negative.")
+            wrong = "has a hinge whose limits are not ordered, or whose resistance is negative"
+            raise InputError(f"{where} {wrong}: correct them.")
     if not all(abs(number) <= LARGEST for number in numbers):
-        raise InputError(f"{where} has a number that is not finite or above {LARGEST:g}.")
+        raise InputError(f"{where} has a number that is not finite or above {LARGEST:g}: correct it.")
     if not (link.mass > 0 and link.friction >= 0):
-        raise InputError(f"{where} needs a positive mass and a friction that is not negative.")
+        raise InputError(f"{where} needs a positive mass and a friction that is not negative: correct them.")
     if not all(abs(math.sqrt(float(np.square(turn).sum())) - 1) < UNIT for turn in turns):
-        raise InputError(f"{where} has a quaternion or axis whose norm is not 1.")
+        raise InputError(f"{where} has a quaternion or axis whose norm is not 1: divide it by its norm.")

@@ -54,7 +54,8 @@ def ray_collector(
             ray.init(include_dashboard=False, log_to_driver=False, logging_level="ERROR")
     except (ConnectionError, ValueError, RuntimeError) as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise InputError(f"No Ray cluster answers ({reason}).") from error
+        start = "start one by `ray start --head`, or correct RAY_ADDRESS"
+        raise InputError(f"No Ray cluster answers ({reason}): {start}.") from error
     room = int(ray.cluster_resources().get("CPU", 0))
     if room < len(seeds):
         raise InputError(f"The Ray cluster has {room} cores, and --workers is {len(seeds)}: use at most {room}.")

@@ -131,7 +131,8 @@ class SetMaker:
         count = sum(map(len, sets))
         if count < FEWEST_GRASPS:
             name, where = self.obj.name, "any region" if label is None else repr(label)
-            raise InputError(f"{name}: only {count} grasps of {where} are valid, and {FEWEST_GRASPS} are needed.")
+            why = f"dora grasps --object {name} --validate sapien shows why"
+            raise InputError(f"{name}: only {count} grasps of {where} are valid, {FEWEST_GRASPS} are needed; {why}.")
         return concatenate(sets).select(slice(POOL))
 
     def valid(self, num: int, seed: int, label: str | None, usable: Usable | None = None) -> GraspCandidates | None:

@@ -253,13 +253,16 @@ def validate(
 
 
 def check_object(candidates: GraspCandidates, obj: AffordanceObject) -> None:
-    """Check that candidates are not known to be of another object.
+    """Check that candidates are not known to be of another object, or of an earlier state of it.
 
     Raises:
         InputError: they are.
     """
-    if candidates.object != obj.name or candidates.digest not in ("", obj.digest):
-        raise InputError(f"the candidates are of another {candidates.object!r} than {obj.name!r}; generate new ones.")
+    if candidates.object != obj.name:
+        of = f"the candidates are of {candidates.object!r}, not of {obj.name!r}"
+        raise InputError(f"{of}: load those of {obj.name!r}.")
+    if candidates.digest not in ("", obj.digest):
+        raise InputError(f"{obj.name!r} has changed since its grasps were made: run dora grasps --object {obj.name}.")
 
 
 def _cases(candidates: GraspCandidates) -> list[Case]:
