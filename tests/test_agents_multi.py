@@ -303,12 +303,13 @@ def test_time_limits_bootstrap_and_failures_do_not(ended: str, monkeypatch: pyte
 
 
 def test_learning_rates_are_adapted_for_each_agent():
-    learner = learner_of(target_kl=1e-4)
+    """The slow agent moves by less than half the target, the other one by more than twice as much as the target."""
+    learner = learner_of(target_kl=3e-4)
     batch = batch_of(learner)
     slow = learner.updates["left"].optimiser.param_groups[0]
     slow["lr"] = 1e-5
     values = learner.update(batch)
-    assert values["learning_rate/left"] == pytest.approx(1.2e-5) or values["learning_rate/left"] == 1e-5
+    assert values["learning_rate/left"] == pytest.approx(1.2e-5)
     assert values["learning_rate/right"] == pytest.approx(5e-4 / 1.3)
     mean = (values["learning_rate/left"] + values["learning_rate/right"]) / 2
     assert learner.critic_adam.param_groups[0]["lr"] == pytest.approx(mean)

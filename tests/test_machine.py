@@ -6,6 +6,7 @@ import time
 from typing import Any
 
 import psutil
+import pytest
 
 from dora.agents.runs.machine import OtherLoad, own_seconds
 
@@ -43,4 +44,11 @@ def test_work_of_others_is_not():
     while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
         time.sleep(0.05)
     assert load.seconds() >= 1.0 - TICK
-    assert load.seconds() >= 0.0
+
+
+def test_each_call_tells_of_the_time_since_the_last_one(monkeypatch: pytest.MonkeyPatch):
+    """The clock of others may run back a little, because two clocks are subtracted: that is no work."""
+    totals = iter([5.0, 7.5, 7.25, 8.0])
+    monkeypatch.setattr(OtherLoad, "_others", lambda _: next(totals))
+    load = OtherLoad()
+    assert [load.seconds() for _ in range(3)] == [2.5, 0.0, 0.75]

@@ -89,9 +89,10 @@ def test_leaning_and_pushing_do_not_count(bench: tasks.DoraEnv):
     bench.reset(seed=0)
 
 
-@pytest.mark.parametrize("push", [0.0, 30.0, 40.0, 60.0])
-def test_pushing_on_after_a_touch_ends_the_blow(bench: tasks.DoraEnv, push: float):
-    """A touch just above the speed of a blow, then a push that alone sinks the whole nail."""
+@pytest.mark.parametrize(("push", "least"), [(0.0, 0.3), (30.0, 5.0), (40.0, 12.0), (60.0, 20.0)])
+def test_pushing_on_after_a_touch_ends_the_blow(bench: tasks.DoraEnv, push: float, least: float):
+    """A touch just above the speed of a blow, then a push [N] that from 40 N alone sinks the whole nail; at least as
+    deep as `least` [mm]."""
     over_nail(bench, 0.006, 0.55)
     body, touched = bench.target_object._bodies[0], [False]
 
@@ -104,7 +105,7 @@ def test_pushing_on_after_a_touch_ends_the_blow(bench: tasks.DoraEnv, push: floa
     depth, driven = run(bench, 8)
     bench.reset(seed=0)
     print(f"{push:g} N: {depth:.1f} mm, driven {driven:.1f} mm")
-    assert depth > 12 or push < 40
+    assert depth > least
     assert 0.3 < driven < 6  # of the 10 mm that it takes
 
 
