@@ -42,10 +42,10 @@ class GraspCandidates:
         position: (c, 3) wrist origin [m].
         quaternion: (c, 4) wrist orientation, wxyz.
         approach: (c, 3) unit direction in which the wrist approaches the grasp.
-        pregrasp: (c, 20) hand joints before closing [rad].
-        grasp: (c, 20) commanded hand joints of the closed hand [rad]; beyond contact, so that the drives squeeze.
+        pregrasp: (c, hand) hand joints before closing [rad].
+        grasp: (c, hand) commanded hand joints of the closed hand [rad]; beyond contact, so that the drives squeeze.
         grasp_class: c names such as "BodyGrasp" or "HandleGrasp".
-        joints: (c, 20) hand joints at contact [rad]; `grasp` if not given.
+        joints: (c, hand) hand joints at contact [rad]; `grasp` if not given.
         contacts: (c, k, 3) contact points of the closed hand on the object [m]; k = 0 if not given.
         contact_finger: (c, k) contact class of each: 0 no contact, 1 palm, 2 thumb, ... 6 pinky.
         contact_map: (c, p) contact semantic map of the hand at `joints`: contact class of each of the p points of the
@@ -69,10 +69,10 @@ class GraspCandidates:
     position: Float[Tensor, "c 3"]
     quaternion: Float[Tensor, "c 4"]
     approach: Float[Tensor, "c 3"]
-    pregrasp: Float[Tensor, "c 20"]
-    grasp: Float[Tensor, "c 20"]
+    pregrasp: Float[Tensor, "c hand"]
+    grasp: Float[Tensor, "c hand"]
     grasp_class: tuple[str, ...]
-    joints: Float[Tensor, "c 20"] = UNKNOWN
+    joints: Float[Tensor, "c hand"] = UNKNOWN
     contacts: Float[Tensor, "c k 3"] = UNKNOWN
     contact_finger: Int[Tensor, "c k"] = UNKNOWN
     contact_map: UInt8[Tensor, "c p"] = UNKNOWN

@@ -112,7 +112,7 @@ class WristHandController(BaseController):
                 for part in joint._objs:
                     part.set_armature(np.array([group.armature[i]], np.float32))
 
-    def begin(self, rows: Int[Tensor, " b"], joints: Float[Tensor, "b 27"]) -> None:
+    def begin(self, rows: Int[Tensor, " b"], joints: Float[Tensor, "b joints"]) -> None:
         """Commands `joints` (arm, hand) [rad] in the environments `rows` at the start of their episodes.
 
         ManiSkill calls `reset` for all environments even in a partial reset; the call that follows does nothing.
@@ -135,7 +135,7 @@ class WristHandController(BaseController):
             self.target = measured
         self._begun, self._starting = False, None
 
-    def expand_hand(self, hand: Float[Tensor, "n h"]) -> Float[Tensor, "n 20"]:
+    def expand_hand(self, hand: Float[Tensor, "n h"]) -> Float[Tensor, "n hand"]:
         """Values of the action's hand components -> values of all hand joints, followers equal to leaders."""
         return self.config.robot.expand_hand(hand) if self.config.coupled else hand
 
@@ -182,7 +182,7 @@ class WristHandController(BaseController):
             self._known = (self.target, self.chain.forward(self.target[:, : self.arm_size]))
         return self._known[1]
 
-    def hand_action(self, joints: Float[Tensor, "n 20"]) -> Float[Tensor, "n h"]:
+    def hand_action(self, joints: Float[Tensor, "n hand"]) -> Float[Tensor, "n h"]:
         """Hand components of the action that ask for these joint targets [rad]."""
         middle, half = (self.hand_upper + self.hand_lower) / 2, (self.hand_upper - self.hand_lower) / 2
         action = ((joints - middle) / half).clamp(-1, 1)
@@ -211,21 +211,21 @@ class WristHandController(BaseController):
         if self.feed_forward:
             self._tell_velocity(torch.zeros_like(self.target[:, : self.arm_size]))
 
-    def _tell_velocity(self, arm: Float[Tensor, "n 7"]) -> None:
+    def _tell_velocity(self, arm: Float[Tensor, "n arm"]) -> None:
         """Sends velocities [rad/s] to the drives of the arm."""
         self.articulation.set_joint_drive_velocity_targets(
             arm, self.joints[: self.arm_size], self.active_joint_indices[: self.arm_size]
         )
 
     def get_state(self) -> dict[str, Tensor]:
-        """The commanded joints, arm then hand: (n, 27) [rad]."""
+        """The commanded joints, arm then hand: (n, joints) [rad]."""
         return {"target": self.target.clone()}
 
     def set_state(self, state: dict[str, Tensor]) -> None:
         """Restores commanded joints and drive targets of all environments."""
         self.restore(state["target"], torch.arange(len(state["target"]), device=self.device))
 
-    def restore(self, target: Float[Tensor, "b 27"], rows: Int[Tensor, " b"]) -> None:
+    def restore(self, target: Float[Tensor, "b joints"], rows: Int[Tensor, " b"]) -> None:
         """Restores commanded joints [rad] and drive targets of the environments `rows`."""
         if len(self.target) == 0:
             self.target = self.qpos.clone()

@@ -96,7 +96,7 @@ class FloatingHand:
         """Places the hand at rest and commands it to stay there.
 
         Args:
-            joints: (20,) hand joints [rad].
+            joints: (hand,) hand joints [rad].
             root: pose of the root in the world; unchanged if None.
             offset: (3,) offset of the palm in the root frame [m]; zero if None. Only with a carriage.
         """
@@ -109,7 +109,7 @@ class FloatingHand:
         self.move(slides.tolist())
 
     def command(self, joints: np.ndarray) -> None:
-        """Sets the drive targets of the hand joints (20,) [rad]."""
+        """Sets the drive targets of the hand joints (hand,) [rad]."""
         for joint, angle in zip(self._joints, joints.tolist(), strict=True):
             joint.set_drive_target(angle)
 

@@ -96,7 +96,7 @@ class Lift:
         position: (3,) wrist at the grasp in the world [m].
         quaternion: (4,) wrist at the grasp in the world, wxyz.
         approach: (3,) unit direction of the approach in the world.
-        pregrasp, grasp: (20,) hand joints before closing and commanded by closing [rad].
+        pregrasp, grasp: (hand,) hand joints before closing and commanded by closing [rad].
         mass: mass of the object [kg].
         friction: Coulomb coefficient of object, hand and table [1].
     """
@@ -185,7 +185,7 @@ def rank(
 
     Raises:
         InputError: the candidates are of another object.
-        RuntimeError: a simulating process died.
+        WorkerFailure: a simulating process died or hangs.
     """
     check_object(candidates, obj)
     execution = execution or Execution()

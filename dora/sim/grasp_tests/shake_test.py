@@ -52,8 +52,8 @@ class Case:
     Attributes:
         position: (3,) object in the wrist frame [m].
         quaternion: (4,) object in the wrist frame, wxyz.
-        pregrasp: (20,) hand joints before closing [rad].
-        grasp: (20,) commanded hand joints of the squeezing hand [rad].
+        pregrasp: (hand,) hand joints before closing [rad].
+        grasp: (hand,) commanded hand joints of the squeezing hand [rad].
     """
 
     position: np.ndarray
@@ -226,7 +226,7 @@ def validate(
 
     Raises:
         InputError: the candidates are of another object.
-        RuntimeError: a simulating process died.
+        WorkerFailure: a simulating process died or hangs.
     """
     check_object(candidates, obj)
     trials = run_cases(
