@@ -30,7 +30,7 @@ class Args(Generic[Numbers]):
     preset: Literal["none", "standard", "hard"] = "standard"
     """How much episodes are randomised and perturbed."""
     guidance: Literal["affordance", "grasps", "none"] = "affordance"
-    """Use affordance maps and grasp candidates, or nothing of them."""
+    """Use affordance maps and grasp candidates, candidates of a search that knows no region, or neither."""
     task: Numbers
     """Numbers of the task."""
 

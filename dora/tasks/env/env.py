@@ -39,7 +39,7 @@ from dora.tasks.mdp.stages import Stages, make_stages
 
 
 class DoraEnv(BaseEnv):
-    """The environment of one or several arms that has a task; one class per registered id, made by `register_task`.
+    """The environment of a task, with one or several arms; one class per registered id, made by `register_task`.
 
     Args:
         guidance: "affordance" puts candidates and regions into observation, reward and action, "grasps" candidates of a

@@ -1,4 +1,4 @@
-"""What a task is: the numbers, the arms, how its scene is built and started, and the MDP; and its registration."""
+"""What a task is: its numbers, its arms, how its scene is built and started, and its MDP."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,8 @@ FRONT_CAMERA = CameraSpec(eye=(1.0, -0.65, 0.42), target=(0.5, 0.0, 0.2), fov=0.
 
 
 class Task(ABC):
-    """One task of one environment, which has it; a subclass says what is built and asked for.
+    """A task: what an environment builds, how episodes begin, and what they ask for. Each environment has its own
+    instance.
 
     Args:
         config: the numbers in force, an instance of `CONFIG`.

@@ -115,7 +115,7 @@ def paper_terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
             "orient": Term(
                 lambda s: (1 - misalignment(s) / pi) * (s.stage >= ORIENT),
                 1.0,
-                doc="-theta with theta = arccos(2 <r, r*>^2 - 1), the rotation left, over pi and plus one",
+                doc="1 - theta / pi, theta: angle from striking axis to nail axis",
             ),
             "strike": Term(lambda s: driven_share(s, c), 1.0, doc="depth driven by blows"),
             **paper_penalty(),

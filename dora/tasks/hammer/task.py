@@ -90,7 +90,7 @@ class HammerConfig(TaskConfig):
     persistent_contacts: bool = False
     """PhysX keeps contact points from step to step (PCM); the fast fingers and hammer pass through each other."""
     contact_offset: float = 0.010
-    """Distance at which PhysX begins to see a contact of a body without its own setting [m]."""
+    """PhysX's contact offset of the objects, and of every body without its own [m]."""
     release: tuple[float, float, float] = (0.50, -0.15, 0.60)
     """Middle of the open hand, over which the hammer is released [m]."""
     spread: float = 0.04
@@ -333,7 +333,7 @@ OBSERVATIONS: dict[str, Entry] = {
     "length": Entry(lambda s: s.object.half[:, 2:], "m", "half length of the hammer"),
     "nail": Entry(nail_in_hand, "m", "the nail's head in the hand frame"),
     "nail_depth": Entry(_nail_depths, "cm", "depth of the nail, and how much of it blows have driven"),
-    "drift": Entry(_drifts, "dm, rad", "motion of the hammer in the hand within 0.25 s"),
+    "drift": Entry(_drifts, "dm, rad", "motion of the hammer in the hand within the window of the task (`window`)"),
     "handle": Entry(tip_distance, "m", "distance of each fingertip's surface from the handle's", True, region=True),
     "face": Entry(face_to_nail, "m", "striking face to the nail's head, world frame", True, region=True),
     "axes": Entry(_axes, "1", "striking and handle axis, world frame", True, region=True),

@@ -41,7 +41,7 @@ class TaskConfig:
     persistent_contacts: bool = True
     """PhysX keeps contact points from step to step (PCM); it misses fingers that slide over an edge, see findings."""
     contact_offset: float = 0.005
-    """Distance at which PhysX begins to see a contact of a body without its own setting [m]."""
+    """PhysX's contact offset of the objects, and of every body without its own [m]."""
     penetration_limit: float = 0.005
     """Largest overlap in an episode that counts as a success [m]."""
     arm_effort: float = 1.0

@@ -69,7 +69,8 @@ class PlaceSettings:
     depth: float = 0.12
     """Depth at which the cube is put down [m]."""
     carry_at: float = 1.15
-    """Angle of the door from which the cube is carried before the cavity: the left hand is there before [rad]."""
+    """Angle of the door from which the cube is carried before the cavity: until then the left hand is in that place
+    [rad]."""
     open_at: float = 1.2
     """Angle of the door from which the cube is carried in [rad]."""
     insertion: float = 0.25
@@ -81,7 +82,7 @@ class PlaceSettings:
     back_off: float = 0.07
     """Way against the approach after the hand has opened, before it leaves; straight out it would drag the cube [m]."""
     lost: float = 0.06
-    """Distance of the cube from where it was grasped in the hand at which it has been lost [m]."""
+    """Distance of the wrist from the candidate's live goal at which the cube has been lost [m]."""
 
 
 def before(s: MicrowaveSnapshot, _: Kept, back: float) -> Pose:
