@@ -60,6 +60,8 @@ def script() -> ModuleType:
         ("--eval-only --zero-correction --env DoraCube-v1 --seed 200000", "seeds from 0 to 199999"),
         ("--eval-only --zero-correction --env DoraCube-v1 --seed 1 --episodes 10001", "10000 starts"),
         ("--eval-only --checkpoint /nowhere.safetensors", "no checkpoint"),
+        ("--eval-only --zero-correction --env DoraCube-v1 --learner.gamma 0.5", "--learner.* has no effect"),
+        ("--eval-only --zero-correction --env DoraCube-v1 --total-steps 5", "--total-steps has no effect"),
         ("--env DoraCube-v1 --checkpoint missing", "--eval-only"),
     ],
 )
@@ -96,6 +98,31 @@ def test_a_bare_command_takes_the_learner_recommended_for_the_task():
         assert config.total_steps == find_task(env).LEARNERS[config.agent]["total_steps"]
     assert run.parse(["--env", "DoraJug-v1", "--agent", "ppo"]).run.agent == "ppo"
     assert recommended("PickCube-v1").agent == "ppo"
+
+
+@pytest.mark.parametrize(
+    ("words", "like"),
+    [
+        ("--env DoraJug-v1 --env DoraCube-v1", "--env DoraCube-v1"),
+        ("--env=DoraCube-v1 --preset none --preset=hard", "--env DoraCube-v1 --preset hard"),
+        ("--env DoraCube-v1 --agent ppo --agent sac", "--env DoraCube-v1 --agent sac"),
+        ("--env DoraCube-v1 --guidance=none", "--env DoraCube-v1 --guidance none"),
+        ("--env DoraCube-v1 --guidance_parts reward filter", "--env DoraCube-v1 --guidance-parts reward filter"),
+        ("--env DoraJug-v1 --guidance-parts prior --guidance-parts=reward", "--env DoraJug-v1 --guidance-parts=reward"),
+        ("--eval_only --zero_correction --env=DoraCube-v1", "--eval-only --zero-correction --env DoraCube-v1"),
+        ("--eval-only --checkpoint {} --seed=3", "--eval-only --checkpoint {} --seed 3"),
+    ],
+)  # fmt: skip
+def test_every_spelling_of_an_option_is_the_same(words: str, like: str):
+    assert run.parse(words.format(COMMITTED[0]).split()) == run.parse(like.format(COMMITTED[0]).split())
+
+
+def test_settings_of_training_do_not_change_an_evaluation(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    words = f"--eval-only --checkpoint {COMMITTED[0]}"
+    assert "--env has no effect" in refusal(script, monkeypatch, capsys, f"{words} --env PickCube-v1")
+    assert "--agent has no effect" in refusal(script, monkeypatch, capsys, f"{words} --agent happo")
 
 
 def test_every_number_of_task_and_learner_is_an_option():

@@ -28,8 +28,11 @@ def candidates(robot: RobotDescription, cube: AffordanceObject) -> GraspCandidat
     def random(*shape: int) -> torch.Tensor:
         return torch.rand(*shape, generator=g)
 
+    def unit(*shape: int) -> torch.Tensor:
+        return torch.nn.functional.normalize(random(*shape), dim=-1)
+
     return GraspCandidates(
-        object="cube", position=random(COUNT, 3), quaternion=random(COUNT, 4), approach=random(COUNT, 3),
+        object="cube", position=random(COUNT, 3), quaternion=unit(COUNT, 4), approach=unit(COUNT, 3),
         pregrasp=random(COUNT, 20), grasp=random(COUNT, 20), grasp_class=("BodyGrasp", "RimGrasp") * (COUNT // 2),
         joints=random(COUNT, 20), contacts=random(COUNT, CONTACTS, 3),
         contact_finger=torch.arange(COUNT * CONTACTS).reshape(COUNT, CONTACTS) % 7,
@@ -156,6 +159,30 @@ def test_damage_is_noticed(candidates: GraspCandidates, tmp_path: Path):
     with pytest.raises(InputError) as error:
         GraspCandidates.load(path)
     one_sentence(error, "no dora-grasps 1 file")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("quaternion", 5.0, "norm is not 1"),
+        ("approach", 100.0, "norm is not 1"),
+        ("grasp", 1e5, "not below 10"),
+        ("position", 1e4, "not below 1000"),
+        ("penetration", torch.inf, "not from 0 to 1"),
+        ("self_penetration", -1.0, "not from 0 to 1"),
+        ("score", 1.5, "not from 0 to 1"),
+    ],
+)
+def test_values_that_no_grasp_has_are_refused(
+    candidates: GraspCandidates, tmp_path: Path, name: str, value: float, words: str
+):
+    broken = getattr(candidates, name).clone()
+    broken[3] = value * broken[3] if name in ("quaternion", "approach") else value
+    path = tmp_path / "a.safetensors"
+    replace(candidates, **{name: broken}).save(path)
+    with pytest.raises(InputError) as error:
+        GraspCandidates.load(path)
+    one_sentence(error, words)
 
 
 def test_the_hand_digest_sees_the_hand_and_not_the_arm(robot: RobotDescription):

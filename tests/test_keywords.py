@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.types import SimConfig
 
 import dora.sim
+from dora.affordance.bundled_sets import load_candidates
 from dora.errors import InputError
 
 WRONG = [
@@ -62,6 +64,9 @@ WRONG = [
     ({"sim_config": {"scene_config": {"contact_offset": float("nan")}}}, "finite number"),
 ]
 """Arguments that are wrong for every task, and words of the answer."""
+CUBE = load_candidates("cube")
+NINE_JOINTS = replace(CUBE, **{name: getattr(CUBE, name)[:, :9] for name in ("pregrasp", "grasp", "joints")})
+"""Grasps of the task's object, and of another hand."""
 OURS = [
     ({"num_envs": 3, "sim_backend": "physx_cpu"}, "use 'physx_cpu_batch' for 3"),
     ({"guidance": 3}, "must be a text"),
@@ -72,6 +77,11 @@ OURS = [
     ({"preset": None}, "must be a text"),
     ({"config": 3}, "config must be a mapping"),
     ({"grasps": "grasps.safetensors"}, "GraspCandidates.load"),
+    ({"grasps": load_candidates("jug")}, "holds grasps of 'jug', not of 'cube'"),
+    ({"grasps": replace(CUBE, digest="0" * 64)}, "another shape or labelling of 'cube'"),
+    ({"grasps": replace(CUBE, valid=torch.zeros(len(CUBE), dtype=torch.bool))}, "no valid grasp"),
+    ({"grasps": NINE_JOINTS}, "9 joints of a hand, and 'diana7_hit' has 20"),
+    ({"robot_uids": "diana7_hit_left"}, "for the robot 'diana7_hit', not 'diana7_hit_left'"),
     ({"robot_uids": 3}, "robot_uids"),
     ({"robot_uids": ()}, "one robot for each"),
 ]

@@ -196,28 +196,39 @@ class GraspCandidates:
         candidates.check_fits(path, object, robot)
         return candidates
 
-    def check_fits(self, path: Path, object: AffordanceObject | None, robot: RobotDescription | None) -> None:
+    def check_fits(
+        self, what: Path | str, object: AffordanceObject | None, robot: RobotDescription | None, stored: bool = True
+    ) -> None:
         """Refuse candidates of another object or robot.
+
+        Args:
+            what: that holds them, for the message.
+            object, robot: that they have to be of, if given.
+            stored: they say what they are of. Otherwise unknown digests are let pass, and another robot with the same
+                hand.
 
         Raises:
             InputError: naming what differs.
         """
+        again = "make it again with `dora grasps`"
         if object is not None and self.object != object.name:
-            raise InputError(
-                f"{path} holds grasps of {self.object!r}, not of {object.name!r}: give the file of that one."
-            )
-        if object is not None and self.digest != object.digest:
-            raise InputError(
-                f"{path} was made for another shape or labelling of {object.name!r}: make it again with `dora grasps`."
-            )
-        if robot is not None and self.robot != robot.name:
-            raise InputError(
-                f"{path} holds grasps for the robot {self.robot!r}, not {robot.name!r}: give the file of that one."
-            )
-        if robot is not None and self.robot_digest != hand_digest(robot):
-            raise InputError(
-                f"{path} was made for another version of the hand of {robot.name!r}: make it again with `dora grasps`."
-            )
+            raise InputError(f"{what} holds grasps of {self.object!r}, not of {object.name!r}: give those of that one.")
+        if object is not None and self.digest != object.digest and (stored or self.digest):
+            raise InputError(f"{what} was made for another shape or labelling of {object.name!r}: {again}.")
+        if robot is not None and self.grasp.shape[1] != len(robot.hand.names):
+            joints = f"{self.grasp.shape[1]} joints of a hand, and {robot.name!r} has {len(robot.hand.names)}"
+            raise InputError(f"{what} holds {joints}: give the grasps of that one.")
+        if (
+            robot is None
+            or not (stored or self.robot_digest)
+            or (not stored and self.robot_digest == hand_digest(robot))
+        ):
+            return
+        if self.robot != robot.name:
+            of = f"{what} holds grasps for the robot {self.robot!r}, not {robot.name!r}"
+            raise InputError(f"{of}: give those of that one (`dora grasps --robot {robot.name}` makes some).")
+        if self.robot_digest != hand_digest(robot):
+            raise InputError(f"{what} was made for another version of the hand of {robot.name!r}: {again}.")
 
 
 FINITE = ("position", "quaternion", "approach", "pregrasp", "grasp", "joints", "contacts")

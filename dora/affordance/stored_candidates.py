@@ -21,16 +21,20 @@ SHAPES: dict[str, tuple[int | str, ...]] = {
     "self_penetration": (), "valid": (), "score": (),
 }  # fmt: skip
 """Shape of the rows of every tensor; those of energy terms are numbers."""
+ANGLES = ("pregrasp", "grasp", "joints")
+"""Tensors of angles."""
+UPPER = {"score": 1.0, "penetration": 1.0, "self_penetration": 1.0}
+"""Largest values of numbers that are not negative, or nan where they are not known: shares [1], depths [m]."""
 REQUIRED = ("position", "quaternion", "approach", "pregrasp", "grasp", "grasp_class")
 """Tensors that a file must have."""
 TEXTS = ("object", "digest", "robot", "robot_digest", "settings")
 """Texts that a file must have; `settings` is long."""
 MOST_CANDIDATES, MOST_CLASSES, LONGEST_TEXT = 1_000_000, 1000, 200
 """Largest number of candidates and of classes, and of characters of a text [1]."""
-LARGEST_NUMBER = 1e6
-"""Every length and angle is smaller [m] or [rad]."""
-SHORTEST = 1e-3
-"""Smallest norm of a quaternion [1]."""
+LARGEST_NUMBER, LARGEST_ANGLE = 1e3, 10.0
+"""Every length [m] and every angle of a joint [rad] is smaller."""
+UNIT = 1e-2
+"""Largest error of the norm of a quaternion or direction [1]."""
 
 
 def check_stored(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> tuple[str, ...]:
@@ -92,15 +96,13 @@ def _check_values(name: str, value: Tensor, fail: Any) -> None:
         fits = value.dtype in (torch.float32, torch.float64)
     if not fits:
         raise fail(f"has the tensor {name!r} of another type or range than it may have")
-    if name in ("position", "approach", "contacts", "pregrasp", "grasp", "joints"):
-        if not bool((value.abs() < LARGEST_NUMBER).all()):
-            raise fail(f"has the tensor {name!r} with numbers that are not finite or too large")
-    elif name == "quaternion":
-        norm = value.norm(dim=-1)
-        if not bool(((norm > SHORTEST) & (norm < LARGEST_NUMBER)).all()):
-            raise fail("has quaternions that are not finite, or of no length")
-    elif name == "score" and not bool((value.isnan() | ((value >= 0) & (value <= 1))).all()):
-        raise fail("has scores that are not shares from 0 to 1")
+    largest = LARGEST_ANGLE if name in ANGLES else LARGEST_NUMBER
+    if name in ("position", "contacts", *ANGLES) and not bool((value.abs() < largest).all()):
+        raise fail(f"has the tensor {name!r} with numbers that are not finite or not below {largest:g}")
+    if name in ("quaternion", "approach") and not bool(((value.norm(dim=-1) - 1).abs() < UNIT).all()):
+        raise fail(f"has the tensor {name!r} with rows that are not finite or whose norm is not 1")
+    if name in UPPER and not bool((value.isnan() | ((value >= 0) & (value <= UPPER[name]))).all()):
+        raise fail(f"has the tensor {name!r} with values that are not from 0 to {UPPER[name]:g}")
 
 
 def _is_name(value: Any) -> bool:

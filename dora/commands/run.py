@@ -41,7 +41,7 @@ from dora.tasks import find_task, make_task
 from dora.tasks.env.options import task_config
 from dora.tasks.mdp.guidance_parts import guidance_in_force
 from dora.tasks.mdp.randomisation import find_preset
-from dora.tools.arguments import early_value, early_values
+from dora.tools.command_line import HELP, read_some
 
 VIDEO_EPISODES = 3
 """Episodes of a film [1]."""
@@ -49,6 +49,11 @@ ZERO = "zero"
 """Name of the agent that evaluates as zero correction."""
 ENTRANCES = ("--env", "--eval-only", "--checkpoint", "--resume")
 """Options that say what is run."""
+OF_TRAINING = (
+    "env", "agent", "learner", "total_steps", "eval_every", "eval_episodes", "stop_success", "checkpoint_seconds",
+    "normaliser_samples", "stagger", "after_success",
+)  # fmt: skip
+"""Settings that have no effect on the evaluation of a policy."""
 SHOWN = "DoraHammer-v1"
 """Task whose defaults --help shows if --env names none."""
 INSTALLED = ("dora", "run")
@@ -80,18 +85,36 @@ class Args(Generic[Numbers, Settings, Agent]):
     """Seed of the first episode that is evaluated or filmed with --eval-only."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class First:
+    """Options that decide the defaults of the others, as in `Args`; None if they are not given."""
+
+    env: str | None = None
+    resume: Path | None = None
+    checkpoint: Path | None = None
+    out: Path | None = None
+    eval_only: bool = False
+    zero_correction: bool = False
+    preset: str | None = None
+    agent: str | None = None
+    guidance: str | None = None
+    guidance_parts: tuple[str, ...] | None = None
+    seed: str | None = None
+
+
 def parse(words: Sequence[str]) -> Args[dict[str, Any], Any, str]:
     """The options of a command line, the settings of the run with all numbers of its task.
 
     Raises:
         InputError: for a task, learner or folder that is not there, or values that make no sense.
     """
-    base = settings_to_start_from(words)
+    first = read_some(First, words)
+    base = settings_to_start_from(first, words)
     task = find_task(base.env)
     numbers = task_config(task.CONFIG, base.preset, base.task)
     agents = Literal[tuple(learners_of(task.LEARNERS))]  # pyright: ignore[reportInvalidTypeForm]
     form: Any = Args[task.CONFIG, LEARNER_CONFIGS[base.agent], agents]  # pyright: ignore[reportInvalidTypeArguments, reportInvalidTypeForm]
-    default = Args(run=replace(base, task=numbers), zero_correction="--eval-only" not in words)
+    default = Args(run=replace(base, task=numbers), zero_correction=not first.eval_only)
     args = tyro.cli(form, default=default, description=__doc__, args=list(words))
     numbers = task_config(task.CONFIG, args.run.preset, args.run.task)
     config = replace(args.run, task=plain(numbers))
@@ -99,49 +122,61 @@ def parse(words: Sequence[str]) -> Args[dict[str, Any], Any, str]:
     guidance_in_force(config.guidance, config.guidance_parts)
     if not args.eval_only:
         return replace(args, run=config)
+    refuse_settings_of_training(base, config)
     if args.zero_correction and not config.has_prior:
         raise InputError("--zero-correction needs guidance with a prior: without one there is nothing to correct.")
-    given = early_value(words, "--seed") is not None
-    first = first_seed(config.seed, config.final_episodes) if given else FINAL_SEED
-    return replace(args, run=config, first_seed=first)
+    episode = FINAL_SEED if first.seed is None else first_seed(config.seed, config.final_episodes)
+    return replace(args, run=config, first_seed=episode)
 
 
-def settings_to_start_from(words: Sequence[str]) -> RunConfig:
+def settings_to_start_from(first: First, words: Sequence[str]) -> RunConfig:
     """Settings whose values are the defaults of the options: those of the run or checkpoint that is named, or the
-    recommended ones of the task."""
-    env, resume, checkpoint = (early_value(words, f"--{name}") for name in ("env", "resume", "checkpoint"))
-    if resume is not None:
-        for option in ("--out", "--checkpoint", "--eval-only"):
-            if any(word.partition("=")[0] == option for word in words):
+    recommended ones of the task.
+
+    Raises:
+        InputError: the options do not go together, or name what is not there.
+    """
+    if first.resume is not None:
+        given = {"--out": first.out, "--checkpoint": first.checkpoint, "--eval-only": first.eval_only or None}
+        for option, value in given.items():
+            if value is not None:
                 raise InputError(f"{option} does not go with --resume, which goes on in its folder: leave it out.")
-        return RunFolder(Path(resume)).read_config()
-    preset = early_value(words, "--preset")
+        return RunFolder(first.resume).read_config()
+    preset = first.preset
     if preset is not None:
         find_preset(preset)
-    if "--eval-only" in words and checkpoint is None and not ("--zero-correction" in words and env is not None):
+    if first.eval_only and first.checkpoint is None and not (first.zero_correction and first.env is not None):
         raise InputError(
             "--eval-only needs --checkpoint with a .safetensors file or a run folder, or --zero-correction with --env."
         )
-    if "--eval-only" in words and checkpoint is not None:
-        config = read_checkpoint(checkpoint_path(Path(checkpoint))).config
+    if first.eval_only and first.checkpoint is not None:
+        config = read_checkpoint(checkpoint_path(first.checkpoint)).config
         if preset is None:
             return config
         return replace(config, preset=preset, task=config.task | {"randomisation": plain(find_preset(preset))})
-    if checkpoint is not None:
+    if first.checkpoint is not None:
         raise InputError("--checkpoint is only evaluated: add --eval-only, or go on with a run by --resume.")
-    if env is None and not {"-h", "--help"} & set(words):
+    if first.env is None and not HELP & set(words):
         near = [word for word in words if difflib.get_close_matches(word.partition("=")[0], ENTRANCES, 1, 0.7)]
         hint = f" instead of {near[0]}" if near else ""
         raise InputError(f"No task is given: add --env{hint}, for example --env DoraCube-v1.")
-    guidance, parts = early_value(words, "--guidance"), early_values(words, "--guidance-parts")
-    return recommended(
-        env or SHOWN,
-        early_value(words, "--agent"),
-        find_task(env or SHOWN).LEARNERS,
-        guidance=guidance,
-        guidance_parts=None if parts is None else tuple(parts),
-        preset=preset,
-    )
+    env = first.env or SHOWN
+    choice: Any = {"guidance": first.guidance, "guidance_parts": first.guidance_parts, "preset": preset}
+    return recommended(env, first.agent, find_task(env).LEARNERS, **choice)
+
+
+def refuse_settings_of_training(base: RunConfig, asked: RunConfig) -> None:
+    """Refuses settings of an evaluation that would change nothing, and another task than the policy's.
+
+    Raises:
+        InputError: naming the first that differs from those of the checkpoint.
+    """
+    for name in OF_TRAINING:
+        theirs, ours = getattr(base, name), getattr(asked, name)
+        if theirs != ours:
+            option = "--learner.*" if name == "learner" else f"--{name.replace('_', '-')}"
+            value = "" if name == "learner" else f" ({theirs} here)"
+            raise InputError(f"{option} has no effect on an evaluation{value}: leave it out.")
 
 
 def refuse_other_settings(folder: Path, stored: RunConfig, asked: RunConfig) -> None:

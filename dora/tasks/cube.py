@@ -13,12 +13,13 @@ from jaxtyping import Bool, Float
 from mani_skill.utils.structs import Actor, Pose
 from torch import Tensor
 
-from dora.affordance.bundled_sets import best_candidates
-from dora.affordance.candidates import GraspCandidates
+from dora.affordance.bundled_sets import ROBOT, best_candidates
+from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.feasibility_table import Grid
 from dora.geometry.rotations import quaternion_apply, quaternion_multiply
+from dora.robot import load_robot
 from dora.sim.actors import build_box
 from dora.sim.cameras import CameraSpec
 from dora.tasks.env.arm import ArmSpec
@@ -278,9 +279,9 @@ def hand_made_candidates(name: str = "cube") -> GraspCandidates:
         position.append(-quaternion_apply(turn, torch.tensor(CUBE_IN_HAND)))
     down = torch.tensor([0.0, 0.0, -1.0]).repeat(4, 1)
     pregrasp, grasp = (torch.tensor(_posture(p)).repeat(4, 1) for p in (OPEN, CLOSED))
-    return GraspCandidates(
-        name, torch.stack(position), torch.stack(quaternion), down, pregrasp, grasp, ("BodyGrasp",) * 4
-    )
+    poses = torch.stack(position), torch.stack(quaternion)
+    made_for = {"robot": ROBOT, "robot_digest": hand_digest(load_robot(ROBOT))}
+    return GraspCandidates(name, *poses, down, pregrasp, grasp, ("BodyGrasp",) * 4, **made_for)
 
 
 def _posture(fingers: tuple[float, float, float, float]) -> list[float]:

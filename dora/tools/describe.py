@@ -15,7 +15,7 @@ import tyro
 from dora.errors import InputError, command
 from dora.tasks import find_task, make_task
 from dora.tasks.env.options import task_config
-from dora.tools.arguments import early_value
+from dora.tools.command_line import read_some
 
 Numbers = TypeVar("Numbers")
 """Numbers of the task that is named."""
@@ -35,13 +35,20 @@ class Args(Generic[Numbers]):
     """Numbers of the task."""
 
 
+@dataclass(frozen=True)
+class First:
+    """The option that decides the defaults of the numbers, as in `Args`."""
+
+    preset: str = "standard"
+
+
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Prints the tables of the task that is named first; returns the exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or words[0].startswith("-"):
         raise InputError("Say which task, for example: python -m dora.tools.describe DoraJug-v1")
-    cls, preset = find_task(words[0]).CONFIG, early_value(words, "--preset") or "standard"
+    cls, preset = find_task(words[0]).CONFIG, read_some(First, words).preset
     form: Any = Args[cls]
     default = Args(env=words[0], task=task_config(cls, preset, None))
     args: Args = tyro.cli(form, default=default, description=__doc__, args=words)

@@ -27,7 +27,6 @@ from dora.geometry.rotations import (
 )
 from dora.parallel import Progress, run_cases
 from dora.robot import RobotDescription
-from dora.sim.grasp_tests.shake_test import check_object
 from dora.sim.grasp_tests.test_scene import GraspTestScene, Physics
 
 Purpose = Literal["ranking", "reporting"]
@@ -187,7 +186,7 @@ def rank(
         InputError: the candidates are of another object.
         WorkerFailure: a simulating process died or hangs.
     """
-    check_object(candidates, obj)
+    candidates.check_fits("the set", obj, None, stored=False)
     execution = execution or Execution()
     lifts = lifts_of(candidates, obj, execution, np.random.default_rng([seed, _STREAM[purpose]]))
     done = run_cases(LiftTest, (obj, robot, execution, physics or Physics()), lifts, processes, progress)

@@ -17,7 +17,6 @@ from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand.grasp_test_settings import DIRECTIONS, STANDARD, GraspTestSettings
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.search.cache import map_of
-from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion, quaternion_apply, quaternion_inverse
 from dora.parallel import Progress, run_cases
 from dora.robot import RobotDescription
@@ -228,7 +227,7 @@ def validate(
         InputError: the candidates are of another object.
         WorkerFailure: a simulating process died or hangs.
     """
-    check_object(candidates, obj)
+    candidates.check_fits("the set", obj, None, stored=False)
     trials = run_cases(
         ShakeTest, (obj, robot, test_settings, physics or Physics()), _cases(candidates), processes, progress
     )
@@ -250,19 +249,6 @@ def validate(
         test_settings=test_settings,
         direction=torch.tensor([trial.direction for trial in trials]),
     )
-
-
-def check_object(candidates: GraspCandidates, obj: AffordanceObject) -> None:
-    """Check that candidates are not known to be of another object, or of an earlier state of it.
-
-    Raises:
-        InputError: they are.
-    """
-    if candidates.object != obj.name:
-        of = f"the candidates are of {candidates.object!r}, not of {obj.name!r}"
-        raise InputError(f"{of}: load those of {obj.name!r}.")
-    if candidates.digest not in ("", obj.digest):
-        raise InputError(f"{obj.name!r} has changed since its grasps were made: run dora grasps --object {obj.name}.")
 
 
 def _cases(candidates: GraspCandidates) -> list[Case]:

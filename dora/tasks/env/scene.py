@@ -16,6 +16,7 @@ from torch import Tensor
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.feasibility_table import ReachTable
+from dora.errors import InputError
 from dora.sim.actors import build_object
 from dora.sim.properties import ObjectProperties
 from dora.sim.robot_agent import DescribedRobot
@@ -115,13 +116,16 @@ class TaskScene:
             parts: of guidance in force.
             grasps: candidates in place of the task's own, by arm.
             tables: tables of f_reach that are known already.
+
+        Raises:
+            InputError: candidates are of another object or hand than the arm's, or none of them is valid.
         """
         region = REGION in parts or not parts
         for (name, spec), agent in zip(task.ARMS.items(), agents, strict=True):
-            found = grasps[name] if name in grasps else task.candidates(name, region)
-            adapted = task.adapted(found, name, agent.description)
-            same = region or name in grasps
-            starts = None if same else task.adapted(task.candidates(name), name, agent.description)
+            given = grasps.get(name)
+            adapted = _fitting(task, name, agent, task.candidates(name, region) if given is None else given)
+            same = region or given is not None
+            starts = None if same else _fitting(task, name, agent, task.candidates(name))
             choice = CandidateChoice(adapted, self.num_envs, self.device)
             size = int(np.prod(agent.single_action_space.shape or ()))
             residual = ResidualAction(self.num_envs, size, self.config.residual, self.device)
@@ -169,6 +173,16 @@ class TaskScene:
             body = actors[k]._bodies[row]
             centre = (body.entity_pose * body.cmass_local_pose).p
             body.add_force_at_point(impulse[row, k].cpu().numpy(), centre, "impulse")
+
+
+def _fitting(task: Task, arm: str, agent: DescribedRobot, grasps: GraspCandidates) -> GraspCandidates:
+    """The valid candidates as an arm executes them; refused if they are of another object or hand."""
+    adapted = task.adapted(grasps, arm, agent.description)
+    what, obj = f"the set of the arm {arm!r}", load_object(task.ARMS[arm].object)
+    adapted.check_fits(what, obj, agent.description, stored=False)
+    if not bool(adapted.valid.any()):
+        raise InputError(f"{what} holds no valid grasp: give others (`dora grasps --object {obj.name}` makes some).")
+    return adapted.select(adapted.valid)
 
 
 def sim_config(c: TaskConfig) -> SimConfig:
