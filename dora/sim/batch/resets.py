@@ -17,6 +17,10 @@ START, STATES = "reset_to_env_states", "env_states"
 """Option of `reset` with states in which episodes begin, and its entry for them."""
 KINDS = ("actors", "articulations")
 """Parts of a state that ManiSkill restores."""
+QUATERNION, UNIT = slice(3, 7), 0.01
+"""Columns of the orientation in the rows of a state, and the largest error of its norm [1]."""
+LARGEST = 1e6
+"""No number of a state of the simulator is larger: SI units and radians."""
 
 
 def checked_options(options: Any, count: int, device: torch.device) -> dict[str, Any]:
@@ -47,6 +51,8 @@ def checked_options(options: Any, count: int, device: torch.device) -> dict[str,
         if not isinstance(start, Mapping) or STATES not in start:
             raise InputError(f"options[{START!r}] must be a dictionary with {STATES!r} and perhaps 'obs'.")
         given = {name: tensors(value, name, device) for name, value in start.items() if value is not None}
+        for name, value in given.items():
+            check_finite_state(value, name)
         out[START] = {name: _in_order(_of_mask(value, mask, count), order) for name, value in given.items()}
     return out
 
@@ -153,10 +159,37 @@ def set_state_dict(original: Callable, env: Any, state: Any, env_idx: Any = None
                 raise InputError(f"the state has {kind} {name!r}, which the scene has not: {suggestion(name, known)}")
             size = 13 if kind == "actors" else 13 + 2 * known[name].max_dof
             everywhere = len(known[name]._objs) == env.num_envs
-            shape = count if everywhere else len(values), size
-            state[kind][name] = rows_of(values, *shape, f"state[{kind!r}][{name!r}]")[order if everywhere else ...]
+            shape, what = (count if everywhere else len(values), size), f"state[{kind!r}][{name!r}]"
+            state[kind][name] = rows_of(values, *shape, what)[order if everywhere else ...]
+            check_body(values, what)
     if count:
         original(env, state, *(() if rows is None else (rows,)))
+
+
+def check_finite_state(state: Any, what: str) -> None:
+    """Refuse a state, or observation, that holds NaN or infinity, which would end in the simulator.
+
+    Raises:
+        InputError: naming the part.
+    """
+    if isinstance(state, Mapping):
+        for name, part in state.items():
+            check_finite_state(part, f"{what}[{name!r}]")
+    elif state.is_floating_point() and not bool(state.isfinite().all()):
+        raise InputError(f"{what} holds a number that is not finite: give the state of a simulation that is sound.")
+
+
+def check_body(values: Tensor, what: str) -> None:
+    """Refuse rows (..., 13 or more) of a state of a body or robot that no simulation can be in.
+
+    Raises:
+        InputError: a number is not finite or above `LARGEST`, or a quaternion is not of norm 1.
+    """
+    check_finite_state(values, what)
+    if bool((values.abs() > LARGEST).any()):
+        raise InputError(f"{what} holds a number above {LARGEST:g}: give the state of a simulation that is sound.")
+    if bool(((values[..., QUATERNION].norm(dim=-1) - 1).abs() > UNIT).any()):
+        raise InputError(f"{what} has a quaternion (columns 3 to 6) whose norm is not 1: divide it by its norm.")
 
 
 def rows_of(values: Tensor, count: int, size: int, what: str) -> Tensor:
@@ -178,4 +211,8 @@ def set_state(original: Callable, env: Any, state: Any, env_idx: Any = None) -> 
     needed = sum(values.shape[-1] for kind in KINDS for values in env._init_raw_state[kind].values())
     whole = env.get_state().shape[1]
     size = needed if flat.ndim and flat.shape[-1] == needed else whole
-    original(env, rows_of(flat, env.num_envs if rows is None else len(rows), size, "the state"), rows)
+    flat = rows_of(flat, env.num_envs if rows is None else len(rows), size, "the state")
+    widths = [values.shape[-1] for kind in KINDS for values in env._init_raw_state[kind].values()]
+    for body in flat[:, :needed].split(widths, -1):
+        check_body(body, "the state")
+    original(env, flat, rows)

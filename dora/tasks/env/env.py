@@ -108,13 +108,9 @@ class DoraEnv(BaseEnv):
             *args,
             num_envs=num_envs,
             robot_uids=options.robots if several else options.robots[0],  # pyright: ignore[reportArgumentType]
-            control_mode=options.control_mode,
-            sim_backend=options.sim_backend,
-            render_backend=options.render_backend,
-            render_mode=render_mode,
-            obs_mode=obs_mode,
-            **kwargs,
-        )
+            control_mode=options.control_mode, sim_backend=options.sim_backend, render_backend=options.render_backend,
+            render_mode=render_mode, obs_mode=obs_mode, **kwargs,
+        )  # fmt: skip
         if several:  # one action for all arms, as learners want it
             self.single_action_space, self.action_space = self.arms.action_spaces(num_envs)
 
@@ -162,8 +158,10 @@ class DoraEnv(BaseEnv):
     def rebuild(self, scale: Float[Tensor, "n objects"]) -> None:
         """Builds the scene anew with objects of these relative sizes; begins new episodes."""
         self._forced_scale = scale
-        super().reset(options={"reconfigure": True})
-        self._forced_scale = None
+        try:
+            super().reset(options={"reconfigure": True})
+        finally:
+            self._forced_scale = None
 
     @property
     def scale(self) -> Float[Tensor, "n objects"]:

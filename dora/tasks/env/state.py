@@ -1,8 +1,9 @@
 """Saving and restoring what a task remembers beside the simulator: memory, stages, guides, noise, sizes."""
 
 import copy
+import re
 from collections.abc import Callable, Iterator, Mapping
-from math import prod
+from math import inf, prod
 from typing import Any
 
 import torch
@@ -11,7 +12,14 @@ from torch import Tensor
 
 from dora.arguments import as_tensor, checked_rows, taken, tensors
 from dora.errors import InputError
-from dora.sim.batch.resets import KINDS, rows_of
+from dora.sim.batch.resets import KINDS, check_body, check_finite_state, rows_of
+
+RANGES = {
+    "mass": (1e-6, 1e4), "friction": (0.0, 1e3), "damping": (0.0, 1e4), "latch": (0.0, 1e4), "scale": (0.05, 20.0),
+    "elapsed": (0.0, 1e9),
+}  # fmt: skip
+"""Ranges of numbers of a state, by the last word of their name: masses [kg], friction [1] or [N m], damping [N m s],
+a latch [N m], relative sizes [1] and control steps [1]."""
 
 
 def remembered(env: Any) -> dict[str, Any]:
@@ -32,7 +40,7 @@ def checked_state(env: Any, state: Any, rows: Tensor) -> dict[str, Any]:
     """A state as tensors with a row for each of the environments `rows`, from arrays or lists, or from one row for all.
 
     Raises:
-        InputError: something is missing, or has another shape than in this environment.
+        InputError: something is missing, has another shape than in this environment, or is in no sound simulation.
     """
     if not isinstance(state, Mapping):
         raise InputError(f"the state must be a dictionary as of get_state_dict, not {type(state).__name__}.")
@@ -42,7 +50,26 @@ def checked_state(env: Any, state: Any, rows: Tensor) -> dict[str, Any]:
         raise InputError(
             f"the state lacks {lacking[0]!r}: it has to be one of {type(env).__name__} with these options."
         )
-    return _fitted(tensors(given, "state", env.device), env._init_raw_state, len(rows), "state")
+    fitted = _fitted(tensors(given, "state", env.device), env._init_raw_state, len(rows), "state")
+    _check(env, fitted)
+    return fitted
+
+
+def _check(env: Any, state: dict[str, Any]) -> None:
+    """Refuses a state, as of `_fitted`, with numbers that are not finite or out of range."""
+    check_finite_state(state, "state")
+    for kind in KINDS:
+        for name, values in state[kind].items():
+            check_body(values, f"state[{kind!r}][{name!r}]")
+    if "task" not in state:
+        return
+    parts = remembered(env)
+    for part in ("task", *parts):
+        own = parts[part].state_ranges() if hasattr(parts.get(part), "state_ranges") else {}
+        for name, values in state[part].items():
+            low, high = own.get(name) or RANGES.get(re.split(r"[._]", name)[-1], (-inf, inf))
+            if not bool(((values >= low) & (values <= high)).all()):
+                raise InputError(f"state[{part!r}][{name!r}] has a number not from {low:g} to {high:g}: correct it.")
 
 
 def _fitted(state: dict[str, Any], like: Mapping[str, Any], count: int, what: str) -> dict[str, Any]:

@@ -55,6 +55,10 @@ class Guide:
         """Everything that changes during an episode, each (n, ...), for state dicts."""
         return self.choice.buffers.get_state() | self.reference.get_state() | self.residual.buffers.get_state()
 
+    def state_ranges(self) -> dict[str, tuple[float, float]]:
+        """Smallest and largest value of some of what `get_state` returns."""
+        return self.reference.phase.state_ranges() | {"chosen": (0.0, float(len(self.choice.candidates) - 1))}
+
     def set_state(self, state: dict[str, Tensor], rows: Tensor | slice) -> None:
         """Inverse of `get_state` for the given rows."""
         self.choice.buffers.set_state(state, rows)

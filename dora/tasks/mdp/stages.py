@@ -80,6 +80,11 @@ class StageMachine(Generic[S]):
         """The machine's (n,) buffers by name."""
         return {"stage": self.index.clone(), "hold_count": self.hold_count.clone(), "furthest": self.furthest.clone()}
 
+    def state_ranges(self) -> dict[str, tuple[float, float]]:
+        """Smallest and largest value of what `get_state` returns."""
+        stages = 0.0, float(len(self))
+        return {"stage": stages, "hold_count": (0.0, float(self._hold.max())), "furthest": stages}
+
     def set_state(self, state: dict[str, Tensor], env_idx: Tensor | slice) -> None:
         """Inverse of `get_state` for the rows `env_idx`; values may be floats, as in flattened states."""
         for name, buffer in (("stage", self.index), ("hold_count", self.hold_count), ("furthest", self.furthest)):
@@ -158,6 +163,10 @@ class ParallelStages:
     def get_state(self) -> dict[str, Tensor]:
         """The buffers (n,) of all machines, by arm and name."""
         return {f"{arm}.{k}": v for arm, machine in self.machines.items() for k, v in machine.get_state().items()}
+
+    def state_ranges(self) -> dict[str, tuple[float, float]]:
+        """Smallest and largest value of what `get_state` returns."""
+        return {f"{arm}.{k}": v for arm, machine in self.machines.items() for k, v in machine.state_ranges().items()}
 
     def set_state(self, state: dict[str, Tensor], env_idx: Tensor | slice) -> None:
         """Inverse of `get_state` for the rows `env_idx`."""
