@@ -62,6 +62,14 @@ WRONG = [
     ({"sim_config": {"sim_freq": 110}}, "a multiple of the control_freq, 20 Hz"),
     ({"sim_config": {"scene_config": {"enable_pmc": False}}}, "did you mean 'enable_pcm'"),
     ({"sim_config": {"scene_config": {"contact_offset": float("nan")}}}, "finite number"),
+    ({"sim_config": {"scene_config": {"contact_offset": -0.1}}}, "must not be negative"),
+    ({"sim_config": {"scene_config": {"enable_pcm": "yes"}}}, "True or False"),
+    ({"sim_config": {"scene_config": {"gravity": [0.0, 0.0, float("nan")]}}}, "three finite numbers"),
+    ({"sim_config": {"scene_config": {"gravity": np.array([0, 0, np.inf])}}}, "three finite numbers"),
+    ({"sim_config": {"scene_config": {"gravity": [0.0, 0.0]}}}, "three finite numbers"),
+    ({"sim_config": {"scene_config": {"gravity": [0, 0, -9]}}}, "three finite numbers"),
+    ({"sim_config": {"scene_config": {"gravity": "x"}}}, "three finite numbers"),
+    ({"sim_config": {"scene_config": {"gravity": 1e30}}}, "three finite numbers"),
 ]
 """Arguments that are wrong for every task, and words of the answer."""
 CUBE = load_candidates("cube")
@@ -100,6 +108,14 @@ def test_arguments_of_maniskills_tasks_on_our_back_end_are_checked_as_well(optio
     with pytest.raises(InputError, match=words) as error:
         gym.make("PickCube-v1", **{"sim_backend": dora.sim.BACKEND, **options})
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("gravity", [[0.0, 0.0, -1.6], np.array([0, 0, -1.6])])
+def test_gravity_is_that_of_the_sim_config(gravity: Any):
+    env: Any = gym.make("DoraCube-v1", num_envs=2, sim_config={"scene_config": {"gravity": gravity}})
+    assert env.unwrapped.scene.sub_scenes[0].physx_system.config.gravity[2] == pytest.approx(-1.6)
+    assert env.reset(seed=0)[0].isfinite().all()
+    env.close()
 
 
 def test_a_robot_that_is_not_there_gets_the_nearest_one():

@@ -227,6 +227,13 @@ def _check_modes(cls: Any, kwargs: Mapping[str, Any]) -> None:
             raise InputError(f"there is no {name} {value!r}: {suggestion(value, known)}")
 
 
+NOT_NEGATIVE = ("spacing", "contact_offset", "sleep_threshold", "bounce_threshold", "static_friction",
+                "dynamic_friction", "restitution")  # fmt: skip
+"""Numbers of a sim_config that must not be negative."""
+LARGEST_GRAVITY = 1e4
+"""[m/s^2]."""
+
+
 # ---- sim_config ----------------------------------------------------------------------------------
 
 
@@ -246,8 +253,26 @@ def _check_sim_config(config: Any, cls: Any, where: str) -> None:
         elif hints[name] is int:
             if _typed(path, value, int) < (1 if name.endswith("_freq") else 0):
                 raise InputError(f"{path} is {value}: it is too small.")
-        elif hints[name] is float and not (isinstance(value, int | float | np.number) and math.isfinite(value)):
-            raise InputError(f"{path} must be a finite number, not {shown(value)}.")
+        elif hints[name] is bool:
+            _typed(path, value, bool)
+        elif hints[name] is float:
+            real = isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)
+            if not real:
+                raise InputError(f"{path} must be a finite number, not {shown(value)}.")
+            if value < 0 and name in NOT_NEGATIVE:
+                raise InputError(f"{path} is {value}: it must not be negative.")
+        elif name == "gravity":
+            _check_gravity(path, value)
+
+
+def _check_gravity(path: str, value: Any) -> None:
+    """Refuses a gravity that is not (3,) finite numbers [m/s^2], in a form that ManiSkill takes."""
+    form = isinstance(value, np.ndarray) or (isinstance(value, list) and all(isinstance(x, float) for x in value))
+    array = np.asarray(value, object)
+    sound = form and array.shape == (3,) and all(isinstance(x, int | float | np.number) for x in array.tolist())
+    if not sound or not (np.abs(array.astype(float)) < LARGEST_GRAVITY).all():
+        form = "three finite numbers, as an array or a list of floats"
+        raise InputError(f"{path} must be {form}, for example [0.0, 0.0, -9.81], not {shown(value)}.")
 
 
 def _check_rates(config: Any, default: SimConfig) -> None:
