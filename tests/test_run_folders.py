@@ -12,17 +12,22 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file
 from test_agents_train import BASE, SMALL_PPO, run, weights
 
 from dora import parallel
 from dora.agents.checkpoint import read_checkpoint
+from dora.agents.config import SACConfig
 from dora.agents.evaluation.play import load_policy
+from dora.agents.learners import replay
 from dora.agents.runs.run_folder import RunFolder
 from dora.agents.runs.trainer import Trainer
 from dora.errors import InputError
 from dora.parallel import name_of_process
 
 SHORT = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=1536, eval_every=512, stagger=False)
+SMALL_SAC = SACConfig(rollout=16, batch=64, warmup=100, critic_only=2, hidden=(16, 16))
+SHORT_SAC = dataclasses.replace(SHORT, agent="sac", learner=SMALL_SAC, total_steps=1024)
 
 
 @pytest.mark.parametrize(
@@ -106,6 +111,42 @@ def test_a_run_without_a_checkpoint_is_resumed_from_its_beginning(tmp_path: Path
     run(tmp_path / "straight", SHORT)
     for name, value in weights(tmp_path / "straight").items():
         assert torch.equal(value, weights(folder.path)[name]), name
+
+
+def test_what_is_left_of_a_run_without_a_checkpoint_does_not_get_into_its_replay_buffer(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    folder = RunFolder(tmp_path / "killed")
+    folder.create(SHORT_SAC)
+    run(tmp_path / "other", dataclasses.replace(SHORT_SAC, seed=5))
+    shutil.copytree(tmp_path / "other" / "checkpoints" / "replay", folder.replay)  # and killed before the checkpoint
+    run(folder.path, SHORT_SAC, resume=True)
+    assert "no checkpoint" in capsys.readouterr().err
+    run(tmp_path / "straight", SHORT_SAC)
+    for path in (tmp_path / "straight" / "checkpoints" / "replay").iterdir():
+        ours, theirs = load_file(folder.replay / path.name), load_file(path)
+        assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
+
+
+def test_shards_of_a_state_that_was_never_finished_are_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(replay, "SHARD", 512)
+    run(tmp_path / "run", SHORT_SAC)
+    newer = tmp_path / "run" / "checkpoints" / "replay" / "0000001024-0000001536.safetensors"
+    newer.write_bytes(b"of a state whose checkpoint was not written")
+    for total_steps in (1536, 2048):
+        run(tmp_path / "run", dataclasses.replace(SHORT_SAC, total_steps=total_steps), resume=True)
+
+
+@pytest.mark.parametrize("left", ["curve.csv", "checkpoints/best.safetensors", "a link"])
+def test_a_run_that_lost_its_checkpoint_does_not_begin_anew(tmp_path: Path, left: str):
+    folder = RunFolder(tmp_path)
+    folder.create(SHORT)
+    if left == "a link":
+        folder.latest.symlink_to(tmp_path / "nowhere")
+    else:
+        (tmp_path / left).write_text("")
+    with pytest.raises(InputError, match=r"latest\.safetensors is missing"):
+        run(tmp_path, SHORT, resume=True)
 
 
 def test_a_finished_run_that_goes_on_is_unfinished_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -88,6 +88,20 @@ class RunFolder:
         """Folder of films."""
         return self.path / "video"
 
+    def has_checkpoint(self) -> bool:
+        """Whether there is a state to go on from; not where a run ended before it wrote one.
+
+        Raises:
+            InputError: there was one, as evaluations show, and it is missing.
+        """
+        if self.latest.exists():
+            return True
+        if self.latest.is_symlink() or self.best.exists() or (self.path / "curve.csv").exists():
+            raise InputError(
+                f"{self.latest} is missing, from which the run would go on: put it back, or start a new run."
+            )
+        return False
+
     def check_free(self) -> None:
         """Refuse a folder in which no run can be begun, before any work.
 

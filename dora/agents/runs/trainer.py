@@ -3,6 +3,7 @@
 import functools
 import os
 import signal
+import sys
 import time
 from typing import Any
 
@@ -94,7 +95,7 @@ class Trainer:
         self._recent = torch.zeros(0, len(self.columns.names))
         self._resumed: dict[str, Tensor] | None = None
         self._last_evaluation: Evaluation | None = None
-        if resume and folder.latest.exists():
+        if resume:
             self._load()
 
     def run(self) -> dict[str, Any]:
@@ -260,6 +261,8 @@ class Trainer:
     def _evaluate(self, log: RunLog, progress: ProgressDisplay, interrupt: Interrupt) -> bool:
         """Evaluate and keep the policy if it is the best so far; returns whether the run may end."""
         counters, config = self.counters, self.config
+        if not self.folder.latest.exists():  # where a policy has been evaluated, there is a checkpoint to go on from
+            self.save()
         start = time.perf_counter()
         evaluation = self._evaluators.run(self.learner.policy, config.eval_episodes, PERIODIC_SEED, interrupt.check)
         self._spend("evaluate", time.perf_counter() - start)
@@ -337,7 +340,19 @@ class Trainer:
         return Checkpoint(self.config, self.sizes, tensors, progress, agents=self.agents)
 
     def _load(self) -> None:
-        path = self.folder.latest
+        """Go on from the latest checkpoint, or begin where the run ended before it wrote one.
+
+        Raises:
+            InputError: it is damaged, of another run, or was there and is missing.
+        """
+        path, replay = self.folder.latest, self.learner.replay
+        if not self.folder.has_checkpoint():
+            print(
+                f"There is no checkpoint in {self.folder.path} yet: the run begins at its first step.", file=sys.stderr
+            )
+            if replay is not None:
+                replay.forget_old_files(self.folder.replay)
+            return
         checkpoint = read_checkpoint(path)
         check_belongs(checkpoint, path, self.config, self.sizes, self.agents, exactly=True)
         check_finite(checkpoint.tensors, path)
@@ -348,8 +363,9 @@ class Trainer:
         self.counters = checked_counters(checkpoint.progress, path)
         if self.counters.best is not None:
             self._read_best()
-        if self.learner.replay is not None:
-            self.learner.replay.load(self.folder.replay, self.config.digest())
+        if replay is not None:
+            replay.load(self.folder.replay, self.config.digest())
+            replay.forget_old_files(self.folder.replay)  # those of a newer state, which was never finished
         self._resumed = checkpoint.tensors
 
 
