@@ -82,6 +82,25 @@ def test_errors_of_the_parser(script: ModuleType, monkeypatch: pytest.MonkeyPatc
     assert exit_info.value.code == 2
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("labels.safetensors", "is no set of grasps"), ("labels.json", "where the report is written, exists")],
+)
+def test_other_files_are_not_replaced(
+    script: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    name: str,
+    words: str,
+):
+    path = tmp_path / name
+    path.write_text('{"object": "mine"}')
+    said = refusal(script, monkeypatch, capsys, f"--object cube --num 2 --out {tmp_path / 'labels.safetensors'}")
+    assert words in said
+    assert path.read_text() == '{"object": "mine"}'
+
+
 def test_files_and_table(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ):

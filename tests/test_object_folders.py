@@ -1,5 +1,7 @@
 """Folders of objects: what is committed is what the models make, users' folders are found, damaged ones are refused."""
 
+import os
+import tempfile
 import time
 from dataclasses import fields, replace
 from pathlib import Path
@@ -18,6 +20,7 @@ from dora.affordance.bundled_sets import bundled_path, load_candidates
 from dora.affordance.objects import build
 from dora.affordance.objects.affordance_object import AffordanceObject, Piece
 from dora.affordance.objects.catalogue import available_objects, load_object, own_objects
+from dora.affordance.objects.decomposition import cache_folder
 from dora.affordance.objects.folder_reading import read_object_folder
 from dora.affordance.objects.folder_writing import write_object_folder
 from dora.affordance.objects.mesh_files import read_ply, write_ply
@@ -282,3 +285,34 @@ def test_meshes_that_are_no_part_any_more_are_removed(folder: Path):
     assert {path.name for path in folder.iterdir()} == {"object.toml", "mesh.ply", "solid.ply", "hull-1.ply"}
     write_object_folder(replace(box, solid=box.mesh, pieces=box.pieces[:1]), folder)
     assert {path.name for path in folder.iterdir()} == {"object.toml", "mesh.ply"}
+
+
+def test_files_of_others_are_not_replaced(folder: Path, tmp_path: Path):
+    (folder / "hull-old.ply").write_text("mine")
+    write_object_folder(load_object(folder), folder)
+    assert (folder / "hull-old.ply").read_text() == "mine"
+    other = tmp_path / "scans"
+    other.mkdir()
+    (other / "mesh.ply").write_text("mine")
+    with pytest.raises(InputError, match=r"mesh\.ply is in a folder without object\.toml: choose another folder"):
+        write_object_folder(load_object(folder), other)
+    assert [path.name for path in other.iterdir()] == ["mesh.ply"]
+
+
+def test_the_source_of_an_object_is_not_replaced(folder: Path):
+    mesh = folder / "mesh.ply"
+    before = mesh.read_bytes()
+    with pytest.raises(InputError, match="would be replaced by what is made of it: choose another folder"):
+        build.run(build.Args((folder,), mesh=mesh, scale=2.0))
+    assert mesh.read_bytes() == before
+
+
+def test_without_a_home_what_is_cached_lies_among_temporary_files(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("DORA_CACHE", raising=False)
+    assert cache_folder() == Path.home() / ".cache" / "dora"
+
+    def no_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", no_home)
+    assert cache_folder() == Path(tempfile.gettempdir()) / f"dora-cache-{os.getuid()}"

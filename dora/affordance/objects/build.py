@@ -17,7 +17,7 @@ import tyro
 
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import own_objects
-from dora.affordance.objects.folder_writing import write_object_folder
+from dora.affordance.objects.folder_writing import check_object_folder, write_object_folder
 from dora.affordance.objects.importing import import_mesh
 from dora.affordance.objects.models import cube, hammer, jug, microwave
 from dora.errors import InputError, command
@@ -75,6 +75,7 @@ def run(args: Args) -> list[Path]:
         return [write_object_folder(model(folder.resolve().name), folder) for folder in folders]
     if len(args.folders) != 1:
         raise InputError("--mesh needs the one folder to write, for example: build my/mug --mesh mug.stl.")
+    check_object_folder(args.folders[0], args.mesh, args.labels)
     found = import_mesh(
         args.mesh, labels=args.labels, scale=args.scale, units=args.units, mass=args.mass, density=args.density
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,8 +54,14 @@ class Deviation:
 
 
 def cache_folder() -> Path:
-    """Folder of cached files: $DORA_CACHE, else ~/.cache/dora. What cannot be stored there is made each time."""
-    return Path(os.environ.get(CACHE_VARIABLE) or Path("~/.cache/dora").expanduser())
+    """Folder of cached files: $DORA_CACHE, else ~/.cache/dora, for who has no home a folder of temporary files. What
+    cannot be stored there is made each time."""
+    if given := os.environ.get(CACHE_VARIABLE):
+        return Path(given)
+    try:
+        return Path.home() / ".cache" / "dora"
+    except RuntimeError:
+        return Path(tempfile.gettempdir()) / f"dora-cache-{os.getuid()}"
 
 
 def decompose(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from dora.robot.shapes import Shape
 
 MESH, SOLID, HULL = "mesh.ply", "solid.ply", "hull-{}.ply"
 """Names of the meshes: the surface, the same without cavities, and the hull that is the piece of that number."""
+WRITTEN = re.compile(r"mesh\.ply|solid\.ply|hull-\d+\.ply")
+"""Names of all files of meshes that are written here."""
 
 
 def write_object_folder(obj: AffordanceObject, folder: Path | str) -> Path:
@@ -28,9 +31,10 @@ def write_object_folder(obj: AffordanceObject, folder: Path | str) -> Path:
         folder: is made if it does not exist.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: the folder cannot be written, or is no folder of an object and has files of these names.
     """
     folder = Path(folder).resolve()
+    check_object_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -45,10 +49,31 @@ def write_object_folder(obj: AffordanceObject, folder: Path | str) -> Path:
             write_ply(folder / HULL.format(index), piece.shape)
             kept.add(HULL.format(index))
     write_bytes(folder / OBJECT_FILE, object_toml(obj, folder.name).encode())
-    for old in {*folder.glob(SOLID), *folder.glob(HULL.format("*"))}:
-        if old.name not in kept:
+    for old in folder.glob("*.ply"):
+        if WRITTEN.fullmatch(old.name) and old.name not in kept:
             old.unlink()
     return folder / OBJECT_FILE
+
+
+def check_object_folder(folder: Path, *sources: Path | None) -> None:
+    """Refuse a folder in which writing an object would replace files of somebody else.
+
+    Args:
+        folder: to be written.
+        sources: files of which the object is made.
+
+    Raises:
+        InputError: naming the file.
+    """
+    place = folder.resolve()
+    for source in sources:
+        path = None if source is None else source.resolve()
+        if path is not None and path.parent == place and (WRITTEN.fullmatch(path.name) or path.name == OBJECT_FILE):
+            raise InputError(f"{source} would be replaced by what is made of it: choose another folder, or move it.")
+    if (place / OBJECT_FILE).is_file() or not place.is_dir():
+        return
+    if foreign := sorted(path for path in place.glob("*.ply") if WRITTEN.fullmatch(path.name)):
+        raise InputError(f"{foreign[0]} is in a folder without {OBJECT_FILE}: choose another folder, or move the file.")
 
 
 def object_toml(obj: AffordanceObject, name: str) -> str:

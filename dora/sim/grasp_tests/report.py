@@ -14,11 +14,14 @@ from dora.affordance.candidates import GraspCandidates
 from dora.affordance.maps.confusion import Confusion
 from dora.errors import InputError
 from dora.files import write_json
+from dora.reading import read_json
 from dora.sim.grasp_tests.failures import FEW
 from dora.sim.grasp_tests.generation import KINDS
 
-SUFFIX = ".safetensors"
-"""Suffix of a file of candidates."""
+SUFFIX, REPORT_SUFFIX = ".safetensors", ".json"
+"""Suffixes of a file of candidates, and of the report beside it."""
+KEYS_OF_A_REPORT = {"object": "", "requested": 0, "optimised": 0}
+"""Some of the keys that every report has."""
 ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "candidates": lambda r: f"{r['optimised']} of {r['requested']}",
     "search": lambda r: f"{r['optimise_seconds']:.1f} s",
@@ -104,7 +107,8 @@ def check_out(out: Path) -> None:
     """Create the folder of a file of candidates and check that it can be written, before the search begins.
 
     Raises:
-        InputError: the name does not end in .safetensors, or the file cannot be written.
+        InputError: the name does not end in .safetensors, the file cannot be written, or it or the report beside it
+            would replace a file that is no such set or report.
     """
     if out.suffix != SUFFIX:
         raise InputError(f"--out is {out}: give a name that ends in {SUFFIX}.")
@@ -115,6 +119,28 @@ def check_out(out: Path) -> None:
         raise InputError(f"Cannot write into {out.parent} ({error.strerror}): choose another --out.") from error
     if out.is_dir():
         raise InputError(f"--out is {out}, which is a folder: choose another name.")
+    if not _is_set(out):
+        raise InputError(f"{out} exists and is no set of grasps: choose another --out, or move the file.")
+    if not _is_report(out.with_suffix(REPORT_SUFFIX)):
+        beside = f"{out.with_suffix(REPORT_SUFFIX)}, where the report is written, exists and is no such report"
+        raise InputError(f"{beside}: choose another --out, or move the file.")
+
+
+def _is_set(path: Path) -> bool:
+    """Whether a file holds candidates, if it exists."""
+    try:
+        return not path.exists() or len(GraspCandidates.load(path)) > 0
+    except InputError:
+        return False
+
+
+def _is_report(path: Path) -> bool:
+    """Whether a file is a report of candidates, if it exists."""
+    try:
+        report = read_json(path, "report of grasps") if path.exists() else KEYS_OF_A_REPORT
+    except InputError:
+        return False
+    return isinstance(report, dict) and KEYS_OF_A_REPORT.keys() <= report.keys()
 
 
 def write_report(report: dict[str, Any], candidates: GraspCandidates, out: Path) -> None:
@@ -124,7 +150,7 @@ def write_report(report: dict[str, Any], candidates: GraspCandidates, out: Path)
         InputError: a file cannot be written.
     """
     candidates.save(out)
-    write_json(out.with_suffix(".json"), report)
+    write_json(out.with_suffix(REPORT_SUFFIX), report)
 
 
 def _percent(share: float | None) -> str:
