@@ -1,7 +1,11 @@
 """Registration of the tasks of Dora and of ManiSkill, the robots, and the batched physics: `import dora` does it."""
 
+import functools
 import importlib.util
+import os
 import warnings
+
+import torch
 
 from dora.errors import ManiSkillMissingError
 
@@ -14,3 +18,6 @@ with warnings.catch_warnings():  # SAPIEN takes its own Vulkan loader then; whet
 
 from dora import tasks as tasks
 from dora.sim import robots as _robots  # noqa: F401
+
+# A forked process has none of the threads that torch would wait for: gymnasium's AsyncVectorEnv would stand still.
+os.register_at_fork(after_in_child=functools.partial(torch.set_num_threads, 1))
