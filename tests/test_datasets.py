@@ -240,7 +240,7 @@ def test_facts_name_every_number(batch: Any):
 class Timed(gym.Wrapper):
     """Episodes of a batch end after two, three, ... steps, and even seeds are successes; nothing is simulated."""
 
-    good = True
+    good, bad = True, -1
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         self.seeds, self.count = torch.tensor(seed), 0
@@ -252,7 +252,8 @@ class Timed(gym.Wrapper):
         ended = self.count == 2 + torch.arange(2)
         success = ended & (self.seeds % 2 == 0) & self.good
         obs = self.seeds[:, None] + 0.1 * self.count
-        return obs, torch.ones(2), success, ended & ~success, {"success": success}
+        bad = ended & (self.seeds == self.bad)
+        return obs, torch.ones(2), success, ended & ~success, {"success": success, "nonfinite": bad}
 
 
 def test_an_episode_ends_where_the_environment_says_so(batch: Any):
@@ -263,6 +264,12 @@ def test_an_episode_ends_where_the_environment_says_so(batch: Any):
     assert found[1].truncated.tolist() == [False, False, True]
     assert not found[1].terminated.any()
     assert (found[0].actions == 1).all()
+
+
+def test_a_simulation_that_is_not_finite_is_left_out(batch: Any, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Timed, "bad", 5)
+    found = [e for _, e in roll_out(Timed(batch), lambda env, obs: obs, Plan(3, seed=4, num_envs=2))]
+    assert [e.seed for e in found] == [4, 6, 7]
 
 
 def test_with_successes_only_further_starts_are_tried(batch: Any):

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import sapien
 import torch
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import dora
 from dora.errors import RECORDS, InputError
+from dora.integrations.torchrl import BatchEnv
 from dora.sim.batch import guard, records
 from dora.sim.batch.actions import checked_action
 from dora.sim.batch.guard import marked
@@ -313,3 +315,38 @@ def test_rows_are_marked_by_what_they_return():
     assert rows.tolist() == terminated.tolist() == i["fail"].tolist() == [False, True, True]
     assert (i["success"].tolist(), i["depth"].tolist()) == ([True, False, False], [1.0, 0.0, 0.0])
     assert (o.tolist(), r.tolist()) == ([[0, 1], [0, 3], [4, 5]], [1, 0, 0])
+
+
+def maniskill(env: Any) -> Any:
+    return ManiSkillVectorEnv(env, auto_reset=False, ignore_terminations=True)
+
+
+def sb3(env: Any) -> Any:
+    pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
+    from dora.integrations.sb3 import BatchVecEnv
+
+    return BatchVecEnv(env, ignore_terminations=True)
+
+
+def torchrl(env: Any) -> Any:
+    return BatchEnv(env, ignore_terminations=True)
+
+
+@pytest.mark.parametrize("wrap", [maniskill, sb3, torchrl], ids=lambda wrap: wrap.__name__)
+def test_a_bad_row_ends_where_terminations_are_ignored(wrap: Callable[[Any], Any]):
+    env = gym.make("DoraCube-v1", num_envs=3, obs_mode="state", sim_backend="physx_cpu_batch")
+    wrapped = wrap(env)
+    begun = wrapped.reset()
+    base: Any = env.unwrapped
+    SPOIL["velocity is NaN"](base)
+    base.scene.px.invalidate()
+    action = np.zeros((3, *base.single_action_space.shape), np.float32)
+    if wrap is torchrl:
+        done = wrapped.step(begun.set("action", torch.from_numpy(action)))["next", "done"].flatten()
+    elif wrap is sb3:
+        done = torch.from_numpy(wrapped.step(action)[2])
+    else:
+        _, _, terminated, truncated, _ = wrapped.step(action)
+        done = terminated | truncated
+    assert done.tolist() == [row == BAD for row in range(3)]
+    env.close()

@@ -124,7 +124,8 @@ def roll_out(
     """Yields the row and the record of each episode in the step that ends it, in the order in which they end.
 
     A round takes at most as many starts as episodes are missing, so which starts are recorded does not depend on the
-    size of the batch: all from the first on, or the first that end in a success.
+    size of the batch: all from the first on, or the first that end in a success. Starts whose simulation comes to be
+    not finite are left out.
 
     Args:
         env: a batch as of `make_batch`, perhaps with a recorder around it.
@@ -148,7 +149,8 @@ def roll_out(
 
 
 def _round(env: gym.Env, act: Act, seeds: list[int], starts: int) -> Iterator[tuple[int, Episode]]:
-    """The episodes of the first `starts` rows, each when it ends; the other rows are moved and not recorded."""
+    """The episodes of the first `starts` rows, each when it ends; the other rows are moved and not recorded, nor are
+    episodes that end because their simulation is not finite."""
     obs, _ = env.reset(seed=seeds)  # pyright: ignore[reportArgumentType]
     trace = _Trace(obs)
     going = np.arange(len(seeds)) < starts
@@ -158,7 +160,8 @@ def _round(env: gym.Env, act: Act, seeds: list[int], starts: int) -> Iterator[tu
         obs, reward, terminated, truncated, info = env.step(action)
         trace.add(obs, action, reward, terminated, truncated, info["success"])
         ended = going & (trace.last("terminated") | trace.last("truncated"))
-        for row in np.flatnonzero(ended).tolist():
+        sound = ~as_array(info.get("nonfinite", np.zeros(len(seeds), bool)))
+        for row in np.flatnonzero(ended & sound).tolist():
             yield row, trace.episode(row, seeds[row])
         going &= ~ended
 

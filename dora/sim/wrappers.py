@@ -47,12 +47,24 @@ def install_wrappers() -> None:
         (BaseEnv, "render", _render),
         (BaseEnv, "_setup_sensors", _setup_sensors),
         (sapien_utils, "create_viewer", _create_viewer),
+        (TimeLimitWrapper, "step", _step_of_time_limit),
     ):
         original = getattr(owner, name)
         setattr(owner, name, wraps(original)(wrapper(original)))
     for name in FORWARDED:
         setattr(TimeLimitWrapper, name, property(lambda self, name=name: self.env.get_wrapper_attr(name)))
     _installed = True
+
+
+def _step_of_time_limit(original: Callable) -> Callable:
+    def step(self: TimeLimitWrapper, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """ManiSkill's step; a simulation that is not finite is over, also for those who ignore terminations."""
+        observation, reward, terminated, truncated, info = original(self, action)
+        if "nonfinite" in info:
+            truncated = truncated | info["nonfinite"].to(truncated.device)
+        return observation, reward, terminated, truncated, info
+
+    return step
 
 
 # ---- how a recording says what it is of ----------------------------------------------------------
