@@ -201,7 +201,7 @@ def stored_or_made(
         save: writes it.
     """
     with contextlib.suppress(InputError, OSError):
-        if path.is_file():
+        if os.path.isfile(path):
             return load(path)
     content = make()
     with contextlib.suppress(InputError, OSError):

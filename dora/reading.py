@@ -81,6 +81,14 @@ def check_size(path: Path, what: str, most: int) -> None:
         raise InputError(f"{path} has {size} bytes; a {what} may have at most {most}: reduce it.")
 
 
+def entries(folder: Path) -> list[Path]:
+    """What lies in a folder, sorted; nothing where there is no folder, or one that may not be read."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return []
+
+
 def read_text(path: Path, what: str, most: int = MOST_TEXT) -> str:
     """Content of a text file, see `decoded`; arguments and errors as for `read_bytes`."""
     try:

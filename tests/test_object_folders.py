@@ -3,6 +3,7 @@
 import os
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from dora.affordance.bundled_sets import bundled_path, load_candidates
+from dora.affordance.candidates import GraspCandidates
 from dora.affordance.objects import build
 from dora.affordance.objects.affordance_object import AffordanceObject, Piece
 from dora.affordance.objects.catalogue import available_objects, load_object, own_objects
@@ -28,7 +30,8 @@ from dora.affordance.reach.feasibility import Reach
 from dora.affordance.reach.feasibility_table import Grid, ReachTable
 from dora.commands import grasps, view
 from dora.errors import InputError
-from dora.robot import load_robot
+from dora.policies.policy import load_policy
+from dora.robot import available_robots, load_robot
 from dora.robot.shapes import Shape
 
 NAMES = ("cube", "hammer", "jug", "microwave")
@@ -316,3 +319,16 @@ def test_without_a_home_what_is_cached_lies_among_temporary_files(monkeypatch: p
 
     monkeypatch.setattr(Path, "home", no_home)
     assert cache_folder() == Path(tempfile.gettempdir()) / f"dora-cache-{os.getuid()}"
+
+
+def test_places_that_cannot_be_looked_into_hold_nothing(monkeypatch: pytest.MonkeyPatch):
+    for variable in ("DORA_OBJECTS", "DORA_ROBOTS"):
+        monkeypatch.setenv(variable, "x" * 5000)
+    assert "jug" in available_objects()
+    assert "diana7_hit" in available_robots()
+
+
+@pytest.mark.parametrize("load", [load_object, load_robot, load_candidates, GraspCandidates.load, load_policy])
+def test_names_that_are_too_long_get_a_sentence(load: Callable[[str], Any]):
+    with pytest.raises(InputError):
+        load("x" * 5000)

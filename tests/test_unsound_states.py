@@ -7,11 +7,11 @@ import gymnasium as gym
 import pytest
 import torch
 
-import dora
 from dora.errors import InputError
+from dora.sim import BACKEND
 
 START = "reset_to_env_states"
-CASES: list[tuple[str, Callable[[dict[str, Any]], None], str]] = [
+CASES: list[tuple[str, Callable[[dict[str, Any]], Any], str]] = [
     ("NaN", lambda s: s["actors"]["cube"][:, 0].fill_(torch.nan), "not finite"),
     ("infinity", lambda s: robot(s)[:, 15].fill_(torch.inf), "not finite"),
     ("far away", lambda s: robot(s)[:, 15].fill_(1e30), "above 1e\\+06"),
@@ -19,7 +19,7 @@ CASES: list[tuple[str, Callable[[dict[str, Any]], None], str]] = [
     ("long quaternion", lambda s: robot(s)[1, 3:7].mul_(2), "norm is not 1"),
 ]
 """Faults of a state of the simulator, and words of the answer."""
-OURS: list[tuple[str, Callable[[dict[str, Any]], None], str]] = [
+OURS: list[tuple[str, Callable[[dict[str, Any]], Any], str]] = [
     ("NaN command", lambda s: s["controller"]["target"][:, 3].fill_(torch.nan), "controller.*not finite"),
     ("no mass", lambda s: s["memory"]["object.cube.mass"].zero_(), "mass.*not from 1e-06"),
     ("negative friction", lambda s: s["memory"]["object.cube.friction"].fill_(-1), "friction.*not from 0"),
@@ -41,19 +41,19 @@ def robot(state: dict[str, Any]) -> torch.Tensor:
 
 @pytest.fixture(scope="module", params=["PickCube-v1", "DoraCube-v1"])
 def env(request: pytest.FixtureRequest) -> Iterator[Any]:
-    made = gym.make(request.param, num_envs=2, sim_backend=dora.sim.BACKEND, obs_mode="state", render_backend="none")
+    made = gym.make(request.param, num_envs=2, sim_backend=BACKEND, obs_mode="state", render_backend="none")
     yield made.unwrapped
     made.close()
 
 
 @pytest.fixture(scope="module")
 def ours() -> Iterator[Any]:
-    made = gym.make("DoraCube-v1", num_envs=2, sim_backend=dora.sim.BACKEND)
+    made = gym.make("DoraCube-v1", num_envs=2, sim_backend=BACKEND)
     yield made.unwrapped
     made.close()
 
 
-def assert_refused(env: Any, spoil: Callable[[dict[str, Any]], None], words: str) -> None:
+def assert_refused(env: Any, spoil: Callable[[dict[str, Any]], Any], words: str) -> None:
     """A spoiled state is refused as such, and as the start of an episode; the environment stays as it was."""
     env.reset(seed=0)
     before, state = env.get_state(), env.get_state_dict()
@@ -69,12 +69,12 @@ def assert_refused(env: Any, spoil: Callable[[dict[str, Any]], None], words: str
 
 
 @pytest.mark.parametrize(("spoil", "words"), [case[1:] for case in CASES], ids=[case[0] for case in CASES])
-def test_a_state_of_the_simulator(env: Any, spoil: Callable[[dict[str, Any]], None], words: str):
+def test_a_state_of_the_simulator(env: Any, spoil: Callable[[dict[str, Any]], Any], words: str):
     assert_refused(env, spoil, words)
 
 
 @pytest.mark.parametrize(("spoil", "words"), [case[1:] for case in OURS], ids=[case[0] for case in OURS])
-def test_what_a_task_remembers(ours: Any, spoil: Callable[[dict[str, Any]], None], words: str):
+def test_what_a_task_remembers(ours: Any, spoil: Callable[[dict[str, Any]], Any], words: str):
     assert_refused(ours, spoil, words)
 
 

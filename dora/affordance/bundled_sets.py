@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from dora.affordance.candidates import GraspCandidates
@@ -73,7 +74,7 @@ def load_candidates(
         InputError: unknown object, no candidates, or candidates that do not fit the object or the robot.
     """
     path = bundled_path(name, region, task)
-    if not path.is_file():
+    if not os.path.isfile(path):
         option = "" if region else " --any-region"
         raise InputError(
             f"the object {str(name)!r} has no grasps ({path}): "

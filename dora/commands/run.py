@@ -203,7 +203,7 @@ def refuse_finished(folder: Path, total_steps: int) -> None:
         InputError: it has been trained for `total_steps`, and its result is written.
     """
     path = folder / "result.json"
-    result = read_result(path) if path.is_file() else None
+    result = read_result(path) if os.path.isfile(path) else None
     if result is not None and result.get("total_steps", 0) >= total_steps:
         raise InputError(
             f"The run in {folder} has ended, its figures are in result.json: give a larger --total-steps to go on, "

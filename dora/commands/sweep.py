@@ -9,6 +9,7 @@ A finished run counts, whichever command made it, if its settings are the same a
 --known. Ctrl-C saves; the same command goes on.
 """
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,7 +110,7 @@ def _check(args: Args) -> None:
         if seed < 0:
             raise InputError(f"--seeds has {seed}, but a seed has to be at least 0.")
     for folder in args.known:
-        if folder != Path("results") and not folder.is_dir():
+        if folder != Path("results") and not os.path.isdir(folder):
             raise InputError(f"--known {folder} is not a folder: leave it out, or name one with finished runs.")
 
 

@@ -11,6 +11,7 @@
 Runs until Ctrl-C.
 """
 
+import os
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +83,7 @@ def content(args: Args) -> tuple[AffordanceObject, GraspCandidates | None]:
 
 def opened(args: Args, source: str) -> AffordanceObject:
     """An object by its name or folder, or from a mesh file with the options for meshes."""
-    if Path(source).is_file() and source not in available_objects():
+    if os.path.isfile(source) and source not in available_objects():
         return import_object(source, labels=args.labels, scale=args.scale, units=args.units)
     if args.labels is not None or args.scale != 1 or args.units != "m":
         raise InputError(f"--labels, --scale and --units belong to a mesh, and {source} is none: leave them out.")
@@ -92,7 +93,7 @@ def opened(args: Args, source: str) -> AffordanceObject:
 def with_bundle(obj: AffordanceObject, robot: RobotDescription) -> tuple[AffordanceObject, GraspCandidates | None]:
     """An object and the grasps in its folder, if there are any."""
     path = None if obj.folder is None else obj.folder / GRASPS_FILE
-    return obj, None if path is None or not path.is_file() else GraspCandidates.load(path, obj, robot)
+    return obj, None if path is None or not os.path.isfile(path) else GraspCandidates.load(path, obj, robot)
 
 
 @command

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -73,7 +74,7 @@ class Recording:
         """
         check_size(path, "trajectory file", MOST_BYTES)
         index_path = path.with_suffix(".json")
-        if not index_path.is_file():
+        if not os.path.isfile(index_path):
             raise InputError(f"{index_path} is missing: the index of a recording has to lie beside {path.name}.")
         index = read_json(index_path, "index of a recording")
         info = index.get("env_info") if isinstance(index, dict) else None

@@ -1,5 +1,6 @@
 """A trained policy as a function of observations, for one environment or many; greedy."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -197,7 +198,7 @@ def load_policy(which: str | Path) -> TaskPolicy:
                 f"train one by dora run --env {env_id} and load its folder."
             )
         return TaskPolicy(read_checkpoint(path), path, Card.read(card) if card.is_file() else None)
-    if isinstance(which, str) and not Path(which).exists():
+    if isinstance(which, str) and not os.path.exists(which):
         check_task_id(which)
     path = checkpoint_path(Path(which))
     return TaskPolicy(read_checkpoint(path), path)

@@ -9,6 +9,7 @@ as one capsule), and no joint carries `<mimic>`, because coupling is a matter of
 from __future__ import annotations
 
 import math
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
@@ -59,7 +60,7 @@ def write_urdf(folder: Path) -> Path:
         InputError: the table is missing or incomplete.
     """
     table = folder / "parameters.yaml"
-    if not table.is_file():
+    if not os.path.isfile(table):
         raise InputError(f"{table} does not exist; give the folder of a robot that has a parameter table.")
     content = read_yaml(table, "parameter table")
     try:

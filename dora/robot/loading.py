@@ -13,7 +13,7 @@ import numpy as np
 
 import dora
 from dora.errors import InputError, shown, suggestion
-from dora.reading import read_toml
+from dora.reading import entries, read_toml
 from dora.robot.description import Contact, Coupling, Finger, JointGroup, Posture, RobotDescription
 from dora.robot.urdf import UrdfModel, read_urdf
 
@@ -49,8 +49,8 @@ def robot_folders() -> dict[str, Path]:
     own = package / "_robots"
     extra = [Path(part) for part in os.environ.get(SEARCH_VARIABLE, "").split(os.pathsep) if part]
     places = [own if own.is_dir() else package.parent / "robots", *extra]
-    files = [file for place in places if place.is_dir() for file in sorted(place.glob(f"*/{ROBOT_FILE}"))]
-    return {file.parent.name: file.parent for file in files}
+    folders = [folder for place in places for folder in entries(place) if os.path.isfile(folder / ROBOT_FILE)]
+    return {folder.name: folder for folder in folders}
 
 
 def available_robots() -> list[str]:
@@ -66,7 +66,7 @@ def load_robot(name_or_folder: str | Path) -> RobotDescription:
     """
     folders = robot_folders()
     folder = folders.get(str(name_or_folder), Path(name_or_folder))
-    if not (folder / ROBOT_FILE).is_file():
+    if not os.path.isfile(folder / ROBOT_FILE):
         hint = suggestion(name_or_folder, sorted(folders))
         raise InputError(f"unknown robot {str(name_or_folder)!r}: {hint}")
     return _load(folder.resolve())

@@ -9,6 +9,7 @@ is S T S of the original's. "Right" and "left" are exchanged in names.
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import xml.etree.ElementTree as ET
@@ -140,8 +141,8 @@ def _mesh_image(path: Path) -> bytes:
     Raises:
         InputError: there is no such file, it is not binary glTF, it is damaged, or declares more than it can hold.
     """
-    if path.suffix != ".glb" or not path.is_file():
-        raise InputError(f"the mesh {path} is {'no .glb file' if path.is_file() else 'missing'}; put one there.")
+    if path.suffix != ".glb" or not os.path.isfile(path):
+        raise InputError(f"the mesh {path} is {'no .glb file' if os.path.isfile(path) else 'missing'}; put one there.")
     check_container(path)
     try:
         scene = trimesh.load_scene(path)

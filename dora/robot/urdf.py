@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -104,7 +105,7 @@ def read_urdf(path: Path) -> UrdfModel:
         InputError: there is no such file, it is too large, it is not XML, a required element is missing, a number is
             not finite, a name is used twice, a lower limit exceeds its upper limit, or the links do not form one tree.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(f"{path} does not exist; name the URDF file in robot.toml.")
     robot = read_xml(path, "URDF")
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -141,7 +142,7 @@ def load_mount(obj: AffordanceObject) -> Mount:
     Raises:
         InputError: the folder says nothing of it, or its file is damaged or does not fit.
     """
-    if obj.folder is None or not (obj.folder / ARTICULATION_FILE).is_file():
+    if obj.folder is None or not os.path.isfile(obj.folder / ARTICULATION_FILE):
         why = f"the object {obj.name!r} is not mounted on anything: its folder has no {ARTICULATION_FILE}"
         raise InputError(f"{why}: write one, or choose an object that has one.")
     path = obj.folder / ARTICULATION_FILE

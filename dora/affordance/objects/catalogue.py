@@ -11,6 +11,7 @@ from dora.affordance.objects.affordance_object import AffordanceObject, Piece
 from dora.affordance.objects.folder_reading import OBJECT_FILE, read_object_folder
 from dora.affordance.objects.importing import import_object
 from dora.errors import InputError, suggestion
+from dora.reading import entries
 
 __all__ = ["AffordanceObject", "Piece", "available_objects", "load_object"]
 
@@ -30,12 +31,11 @@ def object_places() -> dict[str, Path]:
     """Folder, or mesh file, of every object that can be named; of two with one name the later place counts."""
     found: dict[str, Path] = {}
     extra = [Path(part) for part in os.environ.get(SEARCH_VARIABLE, "").split(os.pathsep) if part]
-    for place in filter(Path.is_dir, [own_objects(), *extra]):
-        for path in sorted(place.iterdir()):
-            if path.suffix.lower() in MESHES:
-                found[path.stem] = path
-            elif (path / OBJECT_FILE).is_file():
-                found[path.name] = path
+    for path in (path for place in (own_objects(), *extra) for path in entries(place)):
+        if path.suffix.lower() in MESHES:
+            found[path.stem] = path
+        elif os.path.isfile(path / OBJECT_FILE):
+            found[path.name] = path
     return found
 
 

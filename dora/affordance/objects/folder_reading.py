@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from pathlib import Path
 from typing import Any, get_args
@@ -79,7 +80,7 @@ class _Reader:
 
     def content(self) -> Table:
         """The tables of the file, with known keys alone."""
-        if not self.path.is_file():
+        if not os.path.isfile(self.path):
             raise InputError(f"{self.folder} has no {OBJECT_FILE}; give the folder of an object.")
         content = read_toml(self.path, "file about an object")
         for key in RESERVED:

@@ -5,6 +5,7 @@ PLY is what mesh editors open; doubles, because trimesh writes floats and a roun
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,7 @@ def read_ply(path: Path) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"] | None]
     Raises:
         InputError: no such file, too large, not PLY, damaged, not of triangles, or with numbers out of range.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(f"there is no mesh file {path}; put it there or correct its name.")
     if path.stat().st_size > MOST_BYTES:
         raise InputError(f"{path} has {path.stat().st_size} bytes; reduce the mesh to at most {MOST_BYTES}.")

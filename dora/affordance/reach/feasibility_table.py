@@ -7,6 +7,7 @@ over these; a reset then costs one look-up. A table is stored under a digest of 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -168,7 +169,7 @@ class ReachTable:
             return cls(grid, rest, height, torch.cat(found).to(torch.uint8), digest)
 
         for known in bundled:
-            if known.is_file():
+            if os.path.isfile(known):
                 return load(known)
         return stored_or_made(path, load, make, lambda path, table: table.save(path))
 

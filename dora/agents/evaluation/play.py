@@ -1,6 +1,7 @@
 """Evaluation of a checkpoint, and films of a policy."""
 
 import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ FRAMES_PER_SECOND = 20
 
 def checkpoint_path(path: Path) -> Path:
     """The file meant by `path`: itself, or the best checkpoint of a run folder."""
-    return path / "checkpoints" / "best.safetensors" if path.is_dir() else path
+    return path / "checkpoints" / "best.safetensors" if os.path.isdir(path) else path
 
 
 def load_policy(checkpoint: Checkpoint, path: Path) -> Policy:

@@ -186,7 +186,7 @@ class RunFolder:
             InputError: if this is not a run folder, or its settings do not fit this version.
         """
         path = self.path / "config.yaml"
-        if not path.is_file():
+        if not os.path.isfile(path):
             raise InputError(f"{self.path} is not a run folder (no readable config.yaml): give one that a run printed.")
         config = config_from_dict(read_yaml(path, "file of settings"), f"the settings in {path}")
         try:
