@@ -149,7 +149,7 @@ def test_gymnasium_makes_a_vector_environment_of_what_was_copied(mode: str | Non
 @pytest.mark.parametrize("context", [None, pytest.param("spawn", marks=pytest.mark.slow)])
 def test_processes_of_gymnasium_work(context: str | None):
     """Forked ones, the default on Linux, have none of the threads that torch of this process has begun."""
-    torch.ones(512, 512) @ torch.ones(512, 512)
+    assert float((torch.ones(512, 512) @ torch.ones(512, 512)).mean()) == 512
     _check_vector("DoraCube-v1", "async", vector_kwargs={"context": context})
 
 

@@ -279,9 +279,10 @@ def hand_made_candidates(name: str = "cube") -> GraspCandidates:
         position.append(-quaternion_apply(turn, torch.tensor(CUBE_IN_HAND)))
     down = torch.tensor([0.0, 0.0, -1.0]).repeat(4, 1)
     pregrasp, grasp = (torch.tensor(_posture(p)).repeat(4, 1) for p in (OPEN, CLOSED))
-    poses = torch.stack(position), torch.stack(quaternion)
-    made_for = {"robot": ROBOT, "robot_digest": hand_digest(load_robot(ROBOT))}
-    return GraspCandidates(name, *poses, down, pregrasp, grasp, ("BodyGrasp",) * 4, **made_for)
+    return GraspCandidates(
+        name, torch.stack(position), torch.stack(quaternion), down, pregrasp, grasp, ("BodyGrasp",) * 4, robot=ROBOT,
+        robot_digest=hand_digest(load_robot(ROBOT)),
+    )  # fmt: skip
 
 
 def _posture(fingers: tuple[float, float, float, float]) -> list[float]:
