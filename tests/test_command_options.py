@@ -152,6 +152,7 @@ def test_searches(words: str, message: str, monkeypatch: pytest.MonkeyPatch, cap
         ("view", "x.stl --scale nan", "--scale is nan"),
         ("view", "jug --scale 2", "belong to a mesh"),
         ("view", "jug --host nowhere.invalid", "--host is 'nowhere.invalid'"),
+        ("view", "jug --host 192.0.2.1", "--host is '192.0.2.1', which is no address of this machine"),
         ("view", "jug --pictures /proc/nope", "Cannot make the folder"),
         ("bench", "env --seconds nan", "--seconds is nan"),
         ("bench", "env --seconds -1", "--seconds is -1"),

@@ -25,7 +25,9 @@ def start_server(host: str, port: int, label: str) -> Any:
     if not 1 <= port <= LAST_PORT:
         raise InputError(f"--port is {port} and has to be from 1 to {LAST_PORT}.")
     try:
-        socket.getaddrinfo(host, port)
+        family, kind, protocol, _, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as trial:  # viser would wait for ever
+            trial.bind(place)
     except (OSError, UnicodeError) as error:
         raise InputError(f"--host is {shown(host)}, which is no address of this machine ({error}).") from error
     try:

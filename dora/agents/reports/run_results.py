@@ -12,7 +12,7 @@ from jaxtyping import Float
 from dora.agents.config import NEUTRAL, NEUTRAL_LEARNER
 from dora.agents.evaluation.evaluate import FINAL_SEED
 from dora.agents.runs.progress_table import read_progress
-from dora.agents.runs.stored_results import read_curve, read_episodes, read_result
+from dora.agents.runs.stored_results import check_agreement, read_curve, read_episodes, read_result
 from dora.errors import InputError
 
 DEFAULT_PRESET = "standard"
@@ -71,7 +71,9 @@ def find_runs(root: Path) -> list[Run]:
         if result is not None:
             rows = read_curve(curve) if curve.exists() else []
             trained = read_progress(progress) if progress.exists() else {}
-            episodes, zero = (_episodes(path.with_name(name)) for name in ("eval.csv", "zero.csv"))
+            shares = {"eval.csv": result["success_rate"], "zero.csv": result["zero_success_rate"]}
+            count = result.get("eval_episodes")
+            episodes, zero = (_episodes(path.with_name(name), share, count) for name, share in shares.items())
             runs.append(Run(path.parent, result, rows, trained, episodes, zero))
     if not runs:
         raise InputError(f"there is no finished run under {root}: point at a folder with result.json files in it.")
@@ -108,8 +110,13 @@ def _with_zero(runs: Sequence[Run]) -> list[Run]:
     return filled
 
 
-def _episodes(path: Path) -> dict[str, Float[np.ndarray, " e"]]:
-    return {name: np.array(values) for name, values in read_episodes(path).items()} if path.exists() else {}
+def _episodes(path: Path, share: float | None, count: int | None) -> dict[str, Float[np.ndarray, " e"]]:
+    """Columns of a table of episodes, if there is one, which has to agree with the result beside it."""
+    if not path.exists():
+        return {}
+    columns = read_episodes(path)
+    check_agreement(path, columns, share, count)
+    return {name: np.array(values) for name, values in columns.items()}
 
 
 def grouped(runs: Sequence[Run]) -> dict[Group, list[Run]]:

@@ -14,21 +14,25 @@ MOST_ROWS, MOST_CURVE, MOST_EPISODES = 200_000, 20_000, 20_000
 """Largest number of rows of a progress.csv, of a curve.csv, and of an eval.csv [1]."""
 MOST_COLUMNS, LONGEST_NAME = 1000, 200
 """Largest number of columns of a table, and of characters of a text [1]."""
+ROUNDING = 1e-4
+"""Largest difference of a share that is written twice [1]."""
 LARGEST = 1e12
 """Every number is smaller."""
 CURVE_COLUMNS = ("env_steps", "wall_seconds", "success_rate", "return_mean", "penetration_p95_mm")
 """Columns of a learning curve that a report reads."""
+RISING = ("env_steps", "wall_seconds")
+"""Those that never fall from row to row."""
 EPISODE_COLUMNS = ("episode", "success")
 """Columns that an eval.csv has at least."""
 REQUIRED = {
-    "env": "text", "agent": "text", "guidance": "text", "env_steps": "count", "wall_seconds": "number",
-    "success_rate": "share", "zero_success_rate": "share or none", "penetration_p95_mm": "number or none",
+    "env": "text", "agent": "text", "guidance": "text", "env_steps": "count", "wall_seconds": "amount",
+    "success_rate": "share", "zero_success_rate": "share or none", "penetration_p95_mm": "amount or none",
 }  # fmt: skip
 """Entries of the result of a finished run, and what they are."""
 OPTIONAL = {
     "preset": "text", "guidance_parts": "texts or none", "reward": "text", "checkpoint": "text or none",
     "eval_episodes": "count", "total_steps": "count", "first_seed": "count or none", "task": "mapping",
-    "other_load": "number or none", "raw_success_rate": "share or none", "steps_to_80": "count or none",
+    "other_load": "amount or none", "raw_success_rate": "share or none", "steps_to_80": "count or none",
     "stage_rates": "shares", "seed": "count", "task_config": "mapping or none", "learner_config": "mapping or none",
     "config_digest": "text",
 }  # fmt: skip
@@ -38,7 +42,7 @@ NESTED = {"preset": "text", "guidance_parts": "texts or none"}
 WORDS = {
     "text": f"a text of 1 to {LONGEST_NAME} characters", "texts": "a list of texts", "mapping": "a mapping",
     "shares": "a mapping of names to numbers from 0 to 1", "share": "a number from 0 to 1",
-    "count": "a whole number of at least 0", "number": f"a number below {LARGEST:g}",
+    "count": "a whole number of at least 0", "amount": f"a number from 0 to {LARGEST:g}",
 }  # fmt: skip
 """How messages say what an entry has to be."""
 
@@ -56,7 +60,7 @@ def _fits(value: Any, kind: str) -> bool:
         ),
         "share": lambda: number and 0 <= value <= 1,
         "count": lambda: number and isinstance(value, int) and value >= 0,
-        "number": lambda: number,
+        "amount": lambda: number and value >= 0,
     }[kind]()
 
 
@@ -102,13 +106,17 @@ def read_curve(path: Path) -> list[dict[str, float]]:
     """Rows of a curve.csv with the columns of `CURVE_COLUMNS`; NaN is a value that was not measured.
 
     Raises:
-        InputError: it is too large, no table, or lacks a column or has a cell that is no number.
+        InputError: it is too large, no table, lacks a column, or has a cell that is no number or out of range.
     """
     columns = _read_table(path, CURVE_COLUMNS, MOST_CURVE)
     rows: list[dict[str, float]] = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    earlier = dict.fromkeys(RISING, 0.0)
     for line, row in enumerate(rows, 2):
-        if not (row["env_steps"] >= 0 and row["wall_seconds"] >= 0):
-            raise _damaged(path, f"line {line} has steps or seconds out of range")
+        if not all(row[name] >= earlier[name] for name in RISING):
+            raise _damaged(path, f"line {line} has steps or seconds out of range, or fewer than the line before")
+        if row["success_rate"] < 0 or row["success_rate"] > 1 or row["penetration_p95_mm"] < 0:
+            raise _damaged(path, f"line {line} has a success rate that is not from 0 to 1, or a negative depth")
+        earlier = row
     return rows
 
 
@@ -122,6 +130,26 @@ def read_episodes(path: Path) -> dict[str, list[float]]:
     if not all(value in (0.0, 1.0) for value in columns["success"]):
         raise _damaged(path, "success is not 0 or 1 everywhere")
     return columns
+
+
+def check_agreement(path: Path, episodes: dict[str, list[float]], share: float | None, count: int | None) -> None:
+    """Refuse a table of episodes that are not those of the result beside it.
+
+    Args:
+        path: of the table.
+        episodes: its columns, as of `read_episodes`.
+        share: successes among them, and
+        count: their number, as the result says; None if it does not.
+
+    Raises:
+        InputError: they differ.
+    """
+    successes = episodes["success"]
+    if count is not None and len(successes) != count:
+        raise _damaged(path, f"it has {len(successes)} episodes, and result.json says {count}")
+    if share is not None and successes and abs(sum(successes) / len(successes) - share) > ROUNDING:
+        found = sum(successes) / len(successes)
+        raise _damaged(path, f"a share of {found:.4g} are successes, and result.json says {share:.4g}")
 
 
 def _damaged(path: Path, reason: object) -> InputError:
