@@ -126,6 +126,7 @@ def test_a_run_of_ones_own_is_loaded_by_its_path(tmp_path: Path) -> None:
         ({"guidance": "grasps"}, "has 'grasps'"),
         ({"guidance_parts": ["prior"]}, r"has 'affordance \(prior alone\)'"),
         ({"hand_joints": 15}, "control mode"),
+        ({"obs_mode": "state_dict"}, "hold no plain state"),
         ({"config": {"residual": {"joint": 0.2}}}, r"config\.residual"),
         ({"config": {"optimised": True}}, r"config\.optimised False"),
     ],

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.spaces import Dict
 from torch import Tensor
 
 from dora import registration as registration
@@ -97,6 +98,8 @@ class TaskPolicy:
         name = env.spec.id if env.spec else type(task).__name__
         if not isinstance(task, DoraEnv) or not isinstance(task.task, find_task(self.env_id)):
             raise InputError(f"this policy is of {self.env_id}, not of {name}: load that of the task in hand.")
+        if "state" not in task.obs_mode.split("+"):
+            raise InputError(f"observations of obs_mode {task.obs_mode!r} hold no plain state: {self._remedy()}")
         ours, theirs = self._traits(), traits(task)
         for what, value in ours.items():
             if theirs[what] != value:
@@ -148,10 +151,12 @@ class TaskPolicy:
 
 def traits(env: DoraEnv) -> dict[str, Any]:
     """What decides what the observations and actions of an environment mean, by name."""
+    space = env.single_observation_space
+    plain_state = space["state"] if isinstance(space, Dict) else space
     return {
         "guidance": _words(env.parts),
         "control mode": " and ".join(sorted({arm.agent.control_mode for arm in env.arms.values()})),
-        "observation size": env.single_observation_space.shape[0],  # pyright: ignore[reportOptionalSubscript]
+        "observation size": plain_state.shape[0],  # pyright: ignore[reportOptionalSubscript]
         "action size": env.action_size,
         **_meaning(plain(env.config)),
     }

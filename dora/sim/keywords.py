@@ -217,6 +217,8 @@ def _check_modes(cls: Any, kwargs: Mapping[str, Any]) -> None:
                 raise InputError(
                     f"the obs_mode {part!r} cannot be joined, as in {mode!r}: join textures, as rgb+depth."
                 )
+        if len(set(parts)) < len(parts) or len(set(parts) & set(own)) > 1:
+            raise InputError(f"the obs_mode {mode!r} has parts that exclude each other: join textures, as state+rgb.")
     choices = {
         "reward_mode": cls.SUPPORTED_REWARD_MODES,
         "render_mode": cls.SUPPORTED_RENDER_MODES,

@@ -1,6 +1,7 @@
 """What TensorBoard shows of a run: tags and what they mean, layout, hyperparameters, film, and their writer."""
 
 import itertools
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -133,8 +134,11 @@ class RunLog:
             self._writer._get_file_writer().add_summary(summaries[part])  # add_hparams makes a folder of its own
 
     def close(self) -> None:
-        """Flush and close."""
-        self._writer.close()
+        """Flush and close; what a full disk does not take is lost, and the run has its other files."""
+        try:
+            self._writer.close()
+        except OSError as error:
+            print(f"TensorBoard's events could not all be written ({error.strerror}).", file=sys.stderr)
 
 
 def flat_settings(config: RunConfig) -> dict[str, str | float | bool]:
