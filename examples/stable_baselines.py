@@ -7,6 +7,7 @@ import argparse
 
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecNormalize
 
 from dora.integrations.sb3 import make
 
@@ -18,7 +19,7 @@ parser.add_argument("--episodes", type=int, default=100, help="episodes of the e
 parser.add_argument("--seed", type=int, default=0)
 args = parser.parse_args()
 
-env = make(args.env, num_envs=args.num_envs, ignore_terminations=True)
+env = VecNormalize(make(args.env, num_envs=args.num_envs, ignore_terminations=True), gamma=0.98)
 model = PPO(
     "MlpPolicy", env, n_steps=16, batch_size=256, n_epochs=4, gamma=0.98, learning_rate=3e-4, seed=args.seed,
     policy_kwargs={"net_arch": [256, 128], "log_std_init": -1.0}, device="cpu", verbose=1,
@@ -34,6 +35,7 @@ def count(locals_: dict, _: dict) -> None:
         successes.append(locals_["info"]["is_success"])
 
 
+env.training = env.norm_reward = False
 env.seed(1_000_000)
 evaluate_policy(model, env, n_eval_episodes=args.episodes, callback=count)
 print(f"success in {sum(successes)} of {len(successes)} episodes")

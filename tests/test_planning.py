@@ -10,7 +10,7 @@ from dora.errors import InputError
 from dora.robot import Shape
 from dora.robot.motion import collision
 from dora.robot.motion.collision import KINDS, CollisionModel
-from dora.robot.motion.planning import EDGE_LIMIT, PlanSettings, densified, plan, timed
+from dora.robot.motion.planning import EDGE_LIMIT, PlanSettings, densified, plan
 
 WALL = Shape("box", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.02, 0.25, 0.3))
 WALL_PLACE = np.array([0.55, 0.25, 0.3]), np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
@@ -144,19 +144,3 @@ def test_a_goal_outside_the_limits_is_refused(robot, walled):
     home = robot.postures["home"]
     with pytest.raises(InputError, match="goal"):
         plan(walled, home.arm, robot.arm.upper + 0.1, home.hand)
-
-
-@pytest.mark.parametrize("period", [0.05, 0.01])
-def test_timing_respects_velocity_limits_and_starts_and_ends_at_rest(robot, period):
-    path = densified(postures(robot, 6), EDGE_LIMIT)
-    points = timed(path, robot.arm.velocity, period, RAMP)
-    steps = np.abs(np.diff(points, axis=0)) / (robot.arm.velocity * period)
-    np.testing.assert_allclose(points[[0, -1]], path[[0, -1]], atol=1e-12)
-    assert steps.max() <= 1 + 1e-9
-    assert steps.max(1)[len(steps) // 2] > 0.5
-    assert steps[[0, -1]].max() <= period / RAMP
-
-
-def test_timing_of_a_motion_that_does_not_move(robot):
-    home = robot.postures["home"].arm
-    np.testing.assert_allclose(timed(np.stack([home, home]), robot.arm.velocity, 0.05)[-1], home)

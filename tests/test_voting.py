@@ -14,7 +14,6 @@ from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.maps.affordance_map import AffordanceMap
 from dora.affordance.maps.contact_semantic_map import (
     contact_semantic_map,
-    hand_contacts,
     pressed_contacts,
     wrist_matrix,
 )
@@ -205,20 +204,6 @@ def test_contact_semantic_map_is_the_nearest_of_all_capsules():
     expected = torch.where(gap < 0.005, hand.part[hand.ends.body[0::2]][nearest], 0)
     assert len(expected.unique()) == 7
     assert torch.equal(contact_semantic_map(points, position, quaternion, joints, hand), expected)
-
-
-def test_hand_contacts_lie_on_the_object():
-    hand = HandModel(load_robot("diana7_hit"), dtype=torch.float64)
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
-    field = SignedDistanceField(ball, dtype=torch.float64)
-    wrist = torch.eye(4, dtype=torch.float64)[None].clone()
-    wrist[0, :3, 3] = -torch.tensor(hand.palm_frame.center + 0.022 * hand.palm_frame.normal)
-    poses = hand.forward(wrist, torch.zeros_like(hand.lower)[None])
-    points, part = hand_contacts(hand, field, poses)
-    touching = points[part > 0]
-    assert len(touching) > 0
-    assert (touching.norm(dim=-1) - 0.03).abs().max() < 1e-3
-    assert points.shape[:2] == part.shape == (1, len(hand.contacts.body.unique()))
 
 
 def test_pressed_contacts_are_the_overlapping_parts_on_the_surface():

@@ -13,6 +13,7 @@ from dora.errors import InputError
 from dora.files import make_folder
 from dora.tasks import check_task_id
 from dora.tasks.env.env import DoraEnv
+from dora.tools.episodes import play_out
 
 LAST_SEED = 2**32 - 1
 """Largest seed that NumPy takes."""
@@ -66,11 +67,7 @@ def record_demonstrations(
     task, recorded, tried = cast(DoraEnv, env.unwrapped), 0, 0
     while tried < tries:
         env.reset(seed=[seed + tried + row for row in range(num_envs)])
-        failed, info = np.zeros(num_envs, bool), {}
-        for _ in range(task.max_steps):
-            *_, info = env.step(task.scripted_action())
-            failed |= info["fail"].cpu().numpy()
-        success = info["success"].cpu().numpy() & ~failed
+        success = play_out(env, task.scripted_action)[0].cpu().numpy()
         env.flush_trajectory(env_idxs_to_flush=np.flatnonzero(success))
         tried, recorded = tried + num_envs, recorded + int(success.sum())
     path = Path(env._h5_file.filename)  # pyright: ignore[reportAttributeAccessIssue]

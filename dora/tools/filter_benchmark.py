@@ -24,6 +24,7 @@ from dora.tables import text_table
 from dora.tasks import check_task_id, find_task, make_task, task_ids
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.mdp.guidance_parts import FILTER, PARTS
+from dora.tools.episodes import play_out
 
 BATCH = 64
 """Episodes that run together."""
@@ -112,11 +113,7 @@ def outcomes(env_id: str, episodes: int, preset: str, choice: Choice) -> Outcome
         for batch in range(batches):
             task.reset(seed=SEED + batch)
             reasons.append(_followed(task))
-            failed = torch.zeros(BATCH, dtype=torch.bool)
-            for _ in range(task.max_steps):
-                info = task.step(torch.zeros(BATCH, task.action_size))[-1]
-                failed |= info["fail"].cpu()
-            won.append(info["success"].cpu() & ~failed)
+            won.append(play_out(task, lambda: torch.zeros(BATCH, task.action_size))[0].cpu())
             report((batch + 1) * BATCH, batches * BATCH)
     task.close()
     return Outcomes(torch.cat(reasons), torch.cat(won))

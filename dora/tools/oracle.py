@@ -24,6 +24,7 @@ from dora.tables import share_text, text_table
 from dora.tasks import make_task
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.guidance.exact_correction import exact_correction
+from dora.tools.episodes import play_out
 
 BATCH = 50
 """Episodes that run together."""
@@ -91,13 +92,11 @@ def outcome(args: Args, act: Act, error: float, report: Callable[[int, int], obj
     batches = -(-args.episodes // BATCH)
     for batch in range(batches):
         task.reset(seed=[SEED + batch * BATCH + row for row in range(BATCH)])
-        action, failed = act(task), torch.zeros(BATCH, dtype=torch.bool)
+        action = act(task)
         sizes.append(float(action.square().mean()))
-        for _ in range(task.max_steps):
-            info = task.step(action)[-1]
-            failed |= info["fail"].cpu()
-        success.append(info["success"].cpu() & ~failed)
-        raw.append(info["raw_success"].cpu() & ~failed)
+        won, failed, info = play_out(task, lambda action=action: action)
+        success.append(won.cpu())
+        raw.append((info["raw_success"] & ~failed).cpu())
         report((batch + 1) * BATCH, batches * BATCH)
     task.close()
     return Outcome(torch.cat(success), torch.cat(raw), (sum(sizes) / len(sizes)) ** 0.5)

@@ -10,6 +10,7 @@ from dora.errors import InputError
 from dora.sim.grasp_tests.test_scene import Physics
 from dora.tasks import find_task, make_task
 from dora.tasks.mdp.randomisation import find_preset
+from dora.tools.episodes import play_out
 
 MOST_RATE, MOST_ITERATIONS, MOST_OFFSET = 100_000.0, 255, 1.0
 """Largest rate [Hz], number of position iterations [1] (PhysX's limit) and contact offset [m]."""
@@ -101,13 +102,8 @@ def _executed(env_id: str, physics: Physics, starts: int, preset: str, seed: int
     task = make_task(env_id, starts, preset=preset, config=config)
     try:
         task.reset(seed=seed)
-        action, failed = torch.zeros(starts, task.action_size), torch.zeros(starts, dtype=torch.bool)
-        success, stage = torch.zeros(0), torch.zeros(0)
         begun = time.process_time()
-        for _ in range(task.max_steps):
-            info = task.step(action)[-1]
-            failed |= info["fail"]
-            success, stage = (info["success"] & ~failed).float(), info["stage"].float()
+        won, _, info = play_out(task, lambda: torch.zeros(starts, task.action_size))
         spent = time.process_time() - begun
         max_penetration = task.snapshot.max_penetration
     finally:
@@ -115,4 +111,5 @@ def _executed(env_id: str, physics: Physics, starts: int, preset: str, seed: int
     median, high = (1000 * max_penetration.quantile(q).item() for q in (0.5, 0.95))
     tunnelled = (max_penetration > TUNNELLED).float().mean().item()
     cost = 1e6 * spent / (starts * task.max_steps)
-    return PhysicsRow(physics, success.mean().item(), stage.mean().item(), median, high, tunnelled, cost)
+    success, stage = won.float().mean().item(), info["stage"].float().mean().item()
+    return PhysicsRow(physics, success, stage, median, high, tunnelled, cost)

@@ -26,6 +26,7 @@ from dora.reading import parse_json
 from dora.tasks import find_task, make_task, task_ids
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.mdp.stages import ParallelStages
+from dora.tools.episodes import play_out
 
 FIRST_TRIES, MORE_TRIES = 6, 30
 """Episodes per grasp when a bundled set is ranked: of all grasps, then of the better ones."""
@@ -170,16 +171,12 @@ def _executed(task: DoraEnv, seed: int, region: bool) -> dict[str, Bool[Tensor, 
     """By arm, which of n episodes of the scripted solution succeed, or hold the object in the end whatever its region,
     without failure on the way and within `CLEAN`."""
     task.reset(seed=seed)
-    failed = torch.zeros(task.num_envs, dtype=torch.bool, device=task.device)
-    info: dict[str, Tensor] = {}
-    for _ in range(task.max_steps):
-        *_, info = task.step(task.scripted_action())
-        failed |= info["fail"]
+    success, failed, _ = play_out(task, task.scripted_action)
     clean = ~failed & (task.memory.max_penetration <= CLEAN * task.config.penetration_limit)
     if isinstance(task.machine, ParallelStages):
         return {arm: machine.finished & clean for arm, machine in task.machine.machines.items()}
     (arm,) = task.arms
-    return {arm: clean & (info["success"] if region else task.task.held(task.snapshot))}
+    return {arm: clean & (success if region else task.task.held(task.snapshot))}
 
 
 def ranked(candidates: GraspCandidates, ranking: TaskRanking) -> GraspCandidates:

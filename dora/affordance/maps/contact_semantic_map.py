@@ -72,35 +72,6 @@ def _nearest_part(
     return torch.cat([part, part.new_zeros(1)])[winner].view(count, size)
 
 
-def hand_contacts(
-    hand: HandModel,
-    field: SignedDistanceField,
-    poses: Float[Tensor, "c b 4 4"],
-    contact_distance: float = CONTACT_DISTANCE,
-) -> tuple[Float[Tensor, "c k 3"], Int[Tensor, "c k"]]:
-    """Points of the object that are nearest to each link of the hand, and their contact classes.
-
-    Args:
-        hand: the hand.
-        field: distance field of the object.
-        poses: (c, b, 4, 4) poses of the bodies as from `HandModel.forward`, in the object frame [m].
-        contact_distance: distance above which a link has class 0 [m].
-
-    Returns:
-        Points in the object frame [m], one per link, and contact classes, 0 for no contact.
-    """
-    points = hand.place(poses, hand.contacts)
-    bodies, counts = torch.unique_consecutive(hand.contacts.body, return_counts=True)
-    distance = field.distance(points)
-    nearest = [part.argmin(1) for part in distance.split(counts.tolist(), 1)]
-    index = torch.stack(nearest, 1) + (counts.cumsum(0) - counts)
-    chosen = torch.take_along_dim(points, index.unsqueeze(-1), 1)
-    value, _ = field.sample(chosen.view(-1, 3), CHANNELS)
-    onto = (chosen.view(-1, 3) - value[:, :1] * value[:, 1:]).view_as(chosen)
-    touching = torch.take_along_dim(distance, index, 1) < contact_distance
-    return onto, torch.where(touching, hand.part[bodies], 0)
-
-
 def pressed_contacts(
     hand: HandModel, field: SignedDistanceField, poses: Float[Tensor, "c b 4 4"]
 ) -> tuple[Float[Tensor, "c k 3"], Int[Tensor, "c k"]]:

@@ -131,10 +131,6 @@ class Mount:
         """The link that carries the object."""
         return next(link for link in self.links if link.object)
 
-    def object_in_hinge(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Pose of the object's frame in the hinge's link: position [m], quaternion wxyz."""
-        return self.object_link.position, self.object_link.quaternion
-
 
 def load_mount(obj: AffordanceObject) -> Mount:
     """What an object of a folder is mounted on.

@@ -89,36 +89,6 @@ def densified(path: Float[np.ndarray, "k dof"], spacing: float) -> Float[np.ndar
     return np.concatenate([*pieces, path[-1:]])
 
 
-def timed(
-    path: Float[np.ndarray, "k dof"],
-    velocity: Float[np.ndarray, " dof"],
-    period: float,
-    ramp: float = 0.3,
-) -> Float[np.ndarray, "m dof"]:
-    """Postures along a path in steps of `period`, from rest to rest.
-
-    At full speed one joint moves at its velocity limit on each edge. The speed rises linearly during `ramp` and falls
-    likewise at the end.
-
-    Args:
-        path: way points [rad].
-        velocity: velocity limits of the joints, above 0 [rad/s].
-        period: control period [s].
-        ramp: time from rest to full speed [s].
-
-    Returns:
-        m postures [rad], from the first to the last of the path; no step exceeds velocity * period.
-    """
-    edges = (np.abs(np.diff(path, axis=0)) / velocity).max(1)
-    clock = np.concatenate([[0.0], np.cumsum(edges)])
-    ramp = max(min(ramp, clock[-1]), 1e-9)
-    total = clock[-1] + ramp
-    t = np.minimum(np.arange(int(np.ceil(total / period)) + 1) * period, total)
-    rising, falling = np.minimum(t, ramp), np.maximum(t - (total - ramp), 0.0)
-    travelled = rising**2 / (2 * ramp) + np.clip(t - ramp, 0.0, total - 2 * ramp) + falling - falling**2 / (2 * ramp)
-    return np.stack([np.interp(travelled, clock, joint) for joint in path.T], 1)
-
-
 def _search(
     model: CollisionModel,
     start: np.ndarray,

@@ -48,7 +48,7 @@ class FloatingHand:
     ):
         builder = _hand_builder(scene, robot)
         if carriage:
-            _put_on_carriage(builder, robot.wrist_link)
+            _put_on_carriage(builder)
         entities = builder.build_entities(fix_root_link=True)
         bodies = {e.name: e.find_component_by_type(physx.PhysxArticulationLinkComponent) for e in entities}
         bits = robot.collision_bits()
@@ -152,7 +152,7 @@ def _hand_builder(scene: sapien.Scene, robot: RobotDescription) -> ArticulationB
     return builder
 
 
-def _put_on_carriage(builder: ArticulationBuilder, palm: str) -> None:
+def _put_on_carriage(builder: ArticulationBuilder) -> None:
     """Inserts the three slides between the root and the palm."""
     hand, parent = builder.link_builders, None
     builder.link_builders = []
