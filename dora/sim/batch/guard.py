@@ -167,10 +167,8 @@ def marked(step: Step, found: Bool[Tensor, " n"]) -> tuple[Step, Bool[Tensor, " 
     """
     observation, reward, terminated, truncated, info = step
     rows = found.clone()
-    for value in _floats(observation, len(rows)):
-        rows |= ~value.reshape(len(rows), -1).isfinite().all(1)
-    if isinstance(reward, Tensor) and reward.shape[:1] == rows.shape:
-        rows |= ~reward.reshape(len(rows), -1).isfinite().all(1)
+    for value in _floats((observation, reward), len(rows)):
+        rows |= ~_finite_rows(value)
     info["nonfinite"] = rows
     if not rows.any():
         return step, rows
@@ -189,5 +187,15 @@ def _floats(value: Any, environments: int) -> list[Tensor]:
     """All tensors of floating point numbers in nested mappings that have a row per environment, without pictures."""
     if isinstance(value, Mapping):
         return [t for name, part in value.items() if name not in PICTURES for t in _floats(part, environments)]
+    if isinstance(value, tuple):
+        return [t for part in value for t in _floats(part, environments)]
     fits = isinstance(value, Tensor) and value.is_floating_point() and value.shape[:1] == (environments,)
     return [value] if fits else []
+
+
+def _finite_rows(value: Tensor) -> Bool[Tensor, " n"]:
+    """Which rows of a tensor (n, ...) are finite."""
+    rows = value.detach().reshape(len(value), -1)
+    if rows.device.type != "cpu" or rows.dtype == torch.bfloat16:  # which NumPy does not know
+        return rows.isfinite().all(1)
+    return torch.from_numpy(np.isfinite(rows.numpy()).all(1))  # torch would wake its threads for it, which wait long
