@@ -18,7 +18,9 @@ COLOURS = {
     ("SAC", "affordance"): "#1f618d",
     ("SAC", "none"): "#85c1e9",
 }
-"""Line colour of each learner with and without guidance; others take matplotlib's."""
+"""Line colour of each learner with and without guidance."""
+OTHERS = ("#148f77", "#b9770e", "#7d3c98", "#566573", "#d98880", "#2e86c1")
+"""Line colours of all else, in this order."""
 SECONDS_PER_MINUTE = 60.0
 """Seconds per minute [s]."""
 EPOCHS = 10_000
@@ -75,6 +77,8 @@ def draw_curves(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
     trained = {group: some for group, members in groups.items() if (some := [m for m in members if m.progress])}
     rows = 2 if trained else 1
     figure, axes = pyplot.subplots(rows, 3, figsize=(13, 0.6 + 3.6 * rows), layout="constrained", squeeze=False)
+    for axis in axes.flat:
+        axis.set_prop_cycle(color=OTHERS)
     colours = _draw_evaluations(axes[0], evaluated)
     if trained:
         _draw_training(axes[1], trained, colours)
@@ -99,10 +103,12 @@ def draw_overlap(runs: Sequence[Run], env: str, preset: str, path: Path) -> None
     from matplotlib import pyplot
 
     figure, axis = pyplot.subplots(figsize=(7, 4.2), layout="constrained")
+    axis.set_prop_cycle(color=OTHERS)
     max_penetration = 0.0
     for group, members in grouped(runs).items():
         if group[:2] != (env, preset):
             continue
+        colour = COLOURS.get(group[2:4])
         for tables, style in (([m.episodes for m in members], "-"), (zero_episodes(members), ":")):
             depths = [table["penetration_mm"] for table in tables if "penetration_mm" in table]
             if depths:
@@ -110,7 +116,8 @@ def draw_overlap(runs: Sequence[Run], env: str, preset: str, path: Path) -> None
                 shares = np.arange(1, len(depth) + 1) / len(depth)
                 what = "" if style == "-" else ", zero correction"
                 label = f"{shortened(group[2])}, guidance {shortened(group[3])} ({len(depth)}){what}"
-                axis.step(depth, shares, style, where="post", color=COLOURS.get(group[2:4]), label=label)
+                (line,) = axis.step(depth, shares, style, where="post", color=colour, label=label)
+                colour = line.get_color()
                 max_penetration = max(max_penetration, float(np.percentile(depth, 99)))
     axis.set_xlim(0, 1.05 * max(max_penetration, 1.0))
     axis.set_ylim(0, 1.01)
