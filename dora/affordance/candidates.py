@@ -215,20 +215,25 @@ class GraspCandidates:
             raise InputError(f"{what} holds grasps of {self.object!r}, not of {object.name!r}: give those of that one.")
         if object is not None and self.digest != object.digest and (stored or self.digest):
             raise InputError(f"{what} was made for another shape or labelling of {object.name!r}: {again}.")
-        if robot is not None and self.grasp.shape[1] != len(robot.hand.names):
-            joints = f"{self.grasp.shape[1]} joints of a hand, and {robot.name!r} has {len(robot.hand.names)}"
-            raise InputError(f"{what} holds {joints}: give the grasps of that one.")
-        if (
-            robot is None
-            or not (stored or self.robot_digest)
-            or (not stored and self.robot_digest == hand_digest(robot))
-        ):
+        if robot is not None:
+            self.check_joints(what, robot)
+        if robot is None or (not stored and self.robot_digest in ("", hand_digest(robot))):
             return
         if self.robot != robot.name:
             of = f"{what} holds grasps for the robot {self.robot!r}, not {robot.name!r}"
             raise InputError(f"{of}: give those of that one (`dora grasps --robot {robot.name}` makes some).")
         if self.robot_digest != hand_digest(robot):
             raise InputError(f"{what} was made for another version of the hand of {robot.name!r}: {again}.")
+
+    def check_joints(self, what: Path | str, robot: RobotDescription) -> None:
+        """Refuse candidates of a hand with another number of joints; arguments as for `check_fits`.
+
+        Raises:
+            InputError: they are.
+        """
+        if self.grasp.shape[1] != len(robot.hand.names):
+            joints = f"{self.grasp.shape[1]} joints of a hand, and {robot.name!r} has {len(robot.hand.names)}"
+            raise InputError(f"{what} holds {joints}: give the grasps of that one.")
 
 
 FINITE = ("position", "quaternion", "approach", "pregrasp", "grasp", "joints", "contacts")

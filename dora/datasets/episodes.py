@@ -68,8 +68,9 @@ class Plan:
             InputError: after `FEW` starts for each episode, and `PATIENCE` besides.
         """
         if recorded < self.episodes and tried >= FEW * self.episodes + PATIENCE:
+            what = "starts ended in a success" if self.only_successes else "simulations stayed finite"
             raise InputError(
-                f"only {recorded} of {tried} starts ended in a success, and {self.episodes} are wanted: ask for fewer "
+                f"only {recorded} of {tried} {what}, and {self.episodes} are wanted: ask for fewer "
                 "episodes, another policy or an easier preset, or keep failed ones, too."
             )
 

@@ -30,6 +30,8 @@ from dora.sim.substeps import watch_physics
 
 FRICTION_SPEED = 0.05
 """Angular velocity above which friction is nearly whole [rad/s]."""
+LARGEST = 1e9
+"""No resistance of a state is larger, in SI units."""
 DRIVE_LIMIT = 1e4
 """Largest torque of the viscous drive [N m]: none."""
 STEEL = (0.75, 0.76, 0.78, 1.0)
@@ -106,6 +108,10 @@ class HingedObject:
     def get_state(self) -> dict[str, Tensor]:
         """What the simulator does not keep, each (n,)."""
         return {name: torch.tensor(values, device=self._device) for name, values in self.resistance.items()}
+
+    def state_ranges(self) -> dict[str, tuple[float, float]]:
+        """Smallest and largest value of what `get_state` returns."""
+        return dict.fromkeys(self.resistance, (0.0, LARGEST))
 
     def set_state(self, state: dict[str, Tensor], rows: Tensor) -> None:
         """Inverse of `get_state` for the environments `rows` (b,), whose simulator has been restored."""

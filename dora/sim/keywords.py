@@ -12,6 +12,7 @@ from typing import Any
 import mani_skill.envs.utils.system.backend as backends
 import numpy as np
 import torch
+from jaxtyping import Float
 from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.envs.sapien_env import BaseEnv
@@ -65,7 +66,7 @@ def _init(original: Callable) -> Callable:
         check_names(type(self), kwargs, names)
         if _is_checked(type(self), kwargs):
             config = {} if kwargs.get("sim_config") is None else kwargs["sim_config"]
-            _check_sim_config(config, SimConfig, "sim_config")
+            kwargs["sim_config"] = config = _checked_sim_config(config, SimConfig, "sim_config")
             self.num_envs = kwargs.get("num_envs", 1)  # as in ManiSkill, whose tasks may use it for their settings
             if config != {}:
                 _check_rates(config, self._default_sim_config)
@@ -217,7 +218,7 @@ def _check_modes(cls: Any, kwargs: Mapping[str, Any]) -> None:
                 raise InputError(
                     f"the obs_mode {part!r} cannot be joined, as in {mode!r}: join textures, as rgb+depth."
                 )
-        if len(set(parts)) < len(parts) or len(set(parts) & set(own)) > 1:
+        if len(set(parts)) < len(parts) or len(set(parts) & EXCLUSIVE) > 1:
             raise InputError(f"the obs_mode {mode!r} has parts that exclude each other: join textures, as state+rgb.")
     choices = {
         "reward_mode": cls.SUPPORTED_REWARD_MODES,
@@ -229,6 +230,8 @@ def _check_modes(cls: Any, kwargs: Mapping[str, Any]) -> None:
             raise InputError(f"there is no {name} {value!r}: {suggestion(value, known)}")
 
 
+EXCLUSIVE = frozenset({"none", "state", "state_dict"})
+"""Modes of observations of which only one can be in force."""
 NOT_NEGATIVE = ("spacing", "contact_offset", "sleep_threshold", "bounce_threshold", "static_friction",
                 "dynamic_friction", "restitution")  # fmt: skip
 """Numbers of a sim_config that must not be negative."""
@@ -239,42 +242,51 @@ LARGEST_GRAVITY = 1e4
 # ---- sim_config ----------------------------------------------------------------------------------
 
 
-def _check_sim_config(config: Any, cls: Any, where: str) -> None:
-    """Refuses unknown names, and numbers that are not finite or negative where they are whole."""
+def _checked_sim_config(config: Any, cls: Any, where: str) -> dict[str, Any]:
+    """The settings that are given, as ManiSkill takes them: numbers of Python, gravity as an array.
+
+    Raises:
+        InputError: a name is unknown, or a value of another type or out of range.
+    """
     if isinstance(config, cls):
         config = {field.name: getattr(config, field.name) for field in dataclasses.fields(cls)}
     if not isinstance(config, Mapping):
         raise InputError(f"{where} must be a dictionary or a {cls.__name__}, not {shown(config)}.")
-    hints = typing.get_type_hints(cls)
+    hints, checked = typing.get_type_hints(cls), dict[str, Any]()
     for name, value in config.items():
-        path = f"{where}[{name!r}]"
         if name not in hints:
             raise InputError(f"{where} has no entry {name!r}: {suggestion(name, hints)}")
-        if dataclasses.is_dataclass(hints[name]):
-            _check_sim_config(value, hints[name], path)
-        elif hints[name] is int:
-            if _typed(path, value, int) < (1 if name.endswith("_freq") else 0):
-                raise InputError(f"{path} is {value}: it is too small.")
-        elif hints[name] is bool:
-            _typed(path, value, bool)
-        elif hints[name] is float:
-            real = isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)
-            if not real:
-                raise InputError(f"{path} must be a finite number, not {shown(value)}.")
-            if value < 0 and name in NOT_NEGATIVE:
-                raise InputError(f"{path} is {value}: it must not be negative.")
-        elif name == "gravity":
-            _check_gravity(path, value)
+        checked[name] = _checked_setting(f"{where}[{name!r}]", value, hints[name])
+    return checked
 
 
-def _check_gravity(path: str, value: Any) -> None:
-    """Refuses a gravity that is not (3,) finite numbers [m/s^2], in a form that ManiSkill takes."""
-    form = isinstance(value, np.ndarray) or (isinstance(value, list) and all(isinstance(x, float) for x in value))
-    array = np.asarray(value, object)
-    sound = form and array.shape == (3,) and all(isinstance(x, int | float | np.number) for x in array.tolist())
-    if not sound or not (np.abs(array.astype(float)) < LARGEST_GRAVITY).all():
-        form = "three finite numbers, as an array or a list of floats"
-        raise InputError(f"{path} must be {form}, for example [0.0, 0.0, -9.81], not {shown(value)}.")
+def _checked_setting(path: str, value: Any, hint: Any) -> Any:
+    """One setting, named by its last part."""
+    name = path.rpartition("[")[2].strip("'[]")
+    if dataclasses.is_dataclass(hint):
+        return _checked_sim_config(value, hint, path)
+    if hint is int:
+        if (whole := _typed(path, value, int)) < (1 if name.endswith("_freq") else 0):
+            raise InputError(f"{path} is {value}: it is too small.")
+        return whole
+    if hint is float:
+        if not (isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)):
+            raise InputError(f"{path} must be a finite number, not {shown(value)}.")
+        if value < 0 and name in NOT_NEGATIVE:
+            raise InputError(f"{path} is {value}: it must not be negative.")
+        return float(value)
+    return _checked_gravity(path, value) if name == "gravity" else _typed(path, value, hint)
+
+
+def _checked_gravity(path: str, value: Any) -> Float[np.ndarray, " 3"]:
+    """Gravity [m/s^2] as an array."""
+    try:
+        gravity = np.asarray(value, np.float32)
+    except (TypeError, ValueError):
+        gravity = np.empty(0, np.float32)
+    if gravity.shape != (3,) or not (np.abs(gravity) < LARGEST_GRAVITY).all():
+        raise InputError(f"{path} must be three finite numbers, such as [0, 0, -9.81], not {shown(value)}.")
+    return gravity
 
 
 def _check_rates(config: Any, default: SimConfig) -> None:

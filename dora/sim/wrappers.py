@@ -20,7 +20,7 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 from dora.arguments import as_tensor
 from dora.configs import plain
 from dora.errors import InputError
-from dora.sim.batch.hooks import BACKEND
+from dora.sim.batch.hooks import BACKEND, runs_batched
 from dora.sim.batch.resets import checked_options
 from dora.sim.cameras import check_cameras, check_names, check_settings, check_shown
 from dora.sim.robot_agent import DescribedRobot
@@ -60,8 +60,8 @@ def _step_of_time_limit(original: Callable) -> Callable:
     def step(self: TimeLimitWrapper, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """ManiSkill's step; a simulation that is not finite is over, also for those who ignore terminations."""
         observation, reward, terminated, truncated, info = original(self, action)
-        if "nonfinite" in info:
-            truncated = truncated | info["nonfinite"].to(truncated.device)
+        if runs_batched(self.base_env):
+            truncated = truncated | info["nonfinite"]
         return observation, reward, terminated, truncated, info
 
     return step

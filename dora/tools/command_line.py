@@ -7,6 +7,8 @@ import tyro
 
 HELP = frozenset({"-h", "--help"})
 """Words that ask for help."""
+OF_TYRO = "--tyro-"
+"""Beginning of the options that tyro has by itself, which are about the whole line."""
 Form = TypeVar("Form")
 """A dataclass of options."""
 
@@ -21,5 +23,7 @@ def read_some(form: type[Form], words: Sequence[str]) -> Form:
         form: a dataclass whose fields all have defaults.
         words: of the command line; a wish for help is left to the reading of the whole.
     """
+    if any(word.startswith(OF_TYRO) for word in words):
+        return form()
     read: Any = tyro.cli(form, args=[word for word in words if word not in HELP], return_unknown_args=True)
     return read[0]

@@ -94,7 +94,7 @@ class _Executor:
     `rank_in_task`."""
 
     def __init__(self, env_id: str, preset: str, candidates: Mapping[str, GraspCandidates], region: bool):
-        self.task = make_task(env_id, BATCH, preset=preset, grasps=candidates)
+        self.task = make_task(env_id, BATCH, preset=preset, grasps={k: _all_valid(v) for k, v in candidates.items()})
         self.sizes = {arm: len(found) for arm, found in candidates.items()}
         self.region = region
 
@@ -109,6 +109,11 @@ class _Executor:
                 led = picks[arm].led[won.cpu() & picks[arm].possible]
                 counts[arm] = picks[arm].tries, torch.bincount(led, minlength=self.sizes[arm])
         return counts
+
+
+def _all_valid(candidates: GraspCandidates) -> GraspCandidates:
+    """The candidates without the verdict of the grasp test, so that a task leaves none out."""
+    return replace(candidates, valid=torch.ones_like(candidates.valid))
 
 
 def rank_in_task(
@@ -208,7 +213,7 @@ class _Usable:
 
     def __call__(self, candidates: GraspCandidates) -> Bool[Tensor, " c"]:
         if self._task is None:
-            self._task = make_task(self._env_id, STARTS, grasps={self._arm: candidates})
+            self._task = make_task(self._env_id, STARTS, grasps={self._arm: _all_valid(candidates)})
             self._task.reset(seed=SEED)
         task, arm = self._task, self._task.arms[self._arm]
         adapted = task.task.adapted(candidates, self._arm, arm.agent.description)

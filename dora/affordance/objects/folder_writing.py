@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -70,7 +71,7 @@ def check_object_folder(folder: Path, *sources: Path | None) -> None:
         path = None if source is None else source.resolve()
         if path is not None and path.parent == place and (WRITTEN.fullmatch(path.name) or path.name == OBJECT_FILE):
             raise InputError(f"{source} would be replaced by what is made of it: choose another folder, or move it.")
-    if (place / OBJECT_FILE).is_file() or not place.is_dir():
+    if os.path.isfile(place / OBJECT_FILE) or not os.path.isdir(place):
         return
     if foreign := sorted(path for path in place.glob("*.ply") if WRITTEN.fullmatch(path.name)):
         raise InputError(f"{foreign[0]} is in a folder without {OBJECT_FILE}: choose another folder, or move the file.")

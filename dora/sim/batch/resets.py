@@ -51,9 +51,10 @@ def checked_options(options: Any, count: int, device: torch.device) -> dict[str,
         if not isinstance(start, Mapping) or STATES not in start:
             raise InputError(f"options[{START!r}] must be a dictionary with {STATES!r} and perhaps 'obs'.")
         given = {name: tensors(value, name, device) for name, value in start.items() if value is not None}
-        for name, value in given.items():
-            check_finite_state(value, name)
         out[START] = {name: _in_order(_of_mask(value, mask, count), order) for name, value in given.items()}
+        states = out[START][STATES]
+        for kind in KINDS if isinstance(states, dict) else ():
+            check_finite_state(states.get(kind, {}), f"{STATES}[{kind!r}]")
     return out
 
 
@@ -186,6 +187,7 @@ def check_body(values: Tensor, what: str) -> None:
         InputError: a number is not finite or above `LARGEST`, or a quaternion is not of norm 1.
     """
     check_finite_state(values, what)
+    values = values.float()
     if bool((values.abs() > LARGEST).any()):
         raise InputError(f"{what} holds a number above {LARGEST:g}: give the state of a simulation that is sound.")
     if bool(((values[..., QUATERNION].norm(dim=-1) - 1).abs() > UNIT).any()):

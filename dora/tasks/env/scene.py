@@ -177,8 +177,10 @@ class TaskScene:
 
 def _fitting(task: Task, arm: str, agent: DescribedRobot, grasps: GraspCandidates) -> GraspCandidates:
     """The valid candidates as an arm executes them; refused if they are of another object or hand."""
-    adapted = task.adapted(grasps, arm, agent.description)
     what, obj = f"the set of the arm {arm!r}", load_object(task.ARMS[arm].object)
+    grasps.check_joints(what, agent.description)
+    grasps.check_fits(what, obj, None, stored=False)
+    adapted = task.adapted(grasps, arm, agent.description)
     adapted.check_fits(what, obj, agent.description, stored=False)
     if not bool(adapted.valid.any()):
         raise InputError(f"{what} holds no valid grasp: give others (`dora grasps --object {obj.name}` makes some).")

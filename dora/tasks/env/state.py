@@ -1,7 +1,6 @@
 """Saving and restoring what a task remembers beside the simulator: memory, stages, guides, noise, sizes."""
 
 import copy
-import re
 from collections.abc import Callable, Iterator, Mapping
 from math import inf, prod
 from typing import Any
@@ -14,12 +13,11 @@ from dora.arguments import as_tensor, checked_rows, taken, tensors
 from dora.errors import InputError
 from dora.sim.batch.resets import KINDS, check_body, check_finite_state, rows_of
 
-RANGES = {
-    "mass": (1e-6, 1e4), "friction": (0.0, 1e3), "damping": (0.0, 1e4), "latch": (0.0, 1e4), "scale": (0.05, 20.0),
-    "elapsed": (0.0, 1e9),
-}  # fmt: skip
-"""Ranges of numbers of a state, by the last word of their name: masses [kg], friction [1] or [N m], damping [N m s],
-a latch [N m], relative sizes [1] and control steps [1]."""
+RANGES = {"mass": (1e-9, 1e9), "friction": (0.0, 1e9), "scale": (1e-3, 1e3), "elapsed": (0.0, 1e9)}
+"""Ranges of numbers of "task" and "memory" in a state, by the last word of their name: masses [kg], friction [1],
+relative sizes [1] and control steps [1]."""
+NOT_MEASURED = ("episode.penetration", "episode.max_penetration")
+"""Numbers of the memory that are NaN where overlap is not measured."""
 
 
 def remembered(env: Any) -> dict[str, Any]:
@@ -57,7 +55,8 @@ def checked_state(env: Any, state: Any, rows: Tensor) -> dict[str, Any]:
 
 def _check(env: Any, state: dict[str, Any]) -> None:
     """Refuses a state, as of `_fitted`, with numbers that are not finite or out of range."""
-    check_finite_state(state, "state")
+    measured = {name: v for name, v in state.get("memory", {}).items() if name not in NOT_MEASURED}
+    check_finite_state(state | {"memory": measured}, "state")
     for kind in KINDS:
         for name, values in state[kind].items():
             check_body(values, f"state[{kind!r}][{name!r}]")
@@ -66,9 +65,10 @@ def _check(env: Any, state: dict[str, Any]) -> None:
     parts = remembered(env)
     for part in ("task", *parts):
         own = parts[part].state_ranges() if hasattr(parts.get(part), "state_ranges") else {}
+        usual = RANGES if part in ("task", "memory") else {}
         for name, values in state[part].items():
-            low, high = own.get(name) or RANGES.get(re.split(r"[._]", name)[-1], (-inf, inf))
-            if not bool(((values >= low) & (values <= high)).all()):
+            low, high = own.get(name) or usual.get(name.split(".")[-1], (-inf, inf))
+            if bool(((values < low) | (values > high)).any()):
                 raise InputError(f"state[{part!r}][{name!r}] has a number not from {low:g} to {high:g}: correct it.")
 
 
@@ -182,7 +182,7 @@ def resize(env: Any, state: dict, rows: Tensor) -> None:
     scale = state["task"]["scale"].reshape(len(rows), -1)
     if torch.equal(env.scale[rows], scale):
         return
-    keep = env.get_state_dict()
+    keep = _with_rows(env.get_state_dict(), state, rows)  # what is there may be no sound state
     streams = _streams(env)
     sizes = env.scale.clone()
     sizes[rows] = scale
@@ -193,6 +193,16 @@ def resize(env: Any, state: dict, rows: Tensor) -> None:
         env._batched_main_rng, env._batched_episode_rng, env._episode_seed = streams
         env._episode_rng = env._batched_episode_rng[0]
         env._last_obs = env.get_obs(env.get_info())
+
+
+def _with_rows(state: dict[str, Any], new: Mapping[str, Any], rows: Tensor) -> dict[str, Any]:
+    """A state in which some rows are those of another one, as far as it has them; the first is changed in place."""
+    for name, part in new.items():
+        if isinstance(part, Mapping):
+            _with_rows(state[name], part, rows)
+        else:
+            state[name][rows] = part.reshape(len(rows), *state[name].shape[1:]).to(state[name].dtype)
+    return state
 
 
 def _streams(env: Any) -> tuple[BatchedRNG, BatchedRNG, Any]:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from mani_skill.utils.structs import Actor, Link, Pose
 from torch import Tensor
 
-from dora.affordance.bundled_sets import best_candidates
+from dora.affordance.bundled_sets import ROBOT, best_candidates
 from dora.affordance.candidates import GraspCandidates, hand_digest
 from dora.affordance.objects.articulation import Mount, load_mount
 from dora.affordance.objects.catalogue import load_object
@@ -101,7 +101,8 @@ class MicrowaveTask(Task):
 
     def adapted(self, candidates: GraspCandidates, arm: str, robot: RobotDescription) -> GraspCandidates:
         """The left hand is the mirror image of the right one, for which the bundled candidates were found."""
-        return mirrored(candidates, robot) if arm == LEFT and candidates.robot != robot.name else candidates
+        of_the_other_hand = candidates.robot in ("", ROBOT) and robot.name != ROBOT
+        return mirrored(candidates, robot) if arm == LEFT and of_the_other_hand else candidates
 
     def make_reference(self, scene: TaskScene, arm: str) -> Reference:
         """The left arm opens the door and holds it, the right one waits for that with the cube."""
