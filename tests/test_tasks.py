@@ -1,5 +1,6 @@
 """What every registered Dora task must do, whatever it is about."""
 
+import weakref
 from collections.abc import Iterator
 from typing import Any
 
@@ -39,6 +40,16 @@ def roll(task: DoraEnv, steps: Tensor, **reset) -> Tensor:
     out = [task.reset(**reset)[0]]
     out += [task.step(a)[0] for a in steps]
     return torch.stack(out)
+
+
+def test_a_scene_that_is_built_anew_takes_the_place_of_the_old_one():
+    """PhysX tells every scene of a friction that changes, and one that is never stepped would gather that for ever."""
+    task = tasks.make_task("DoraCube-v1", 2)
+    for build in (lambda: task.reset(seed=0), lambda: task.rebuild(1.05 * task.scale)):
+        old = weakref.ref(task.scene)
+        build()
+        assert old() is None
+    task.close()
 
 
 @pytest.fixture(scope="module", params=tasks.task_ids())

@@ -27,7 +27,7 @@ from dora.tasks.env.arm_group import ArmGroup
 from dora.tasks.env.description import describe
 from dora.tasks.env.episode_start import begin_episodes, drawn_sizes, requested, start_numbers
 from dora.tasks.env.options import check_grasps, check_options, task_config
-from dora.tasks.env.scene import TaskScene, film_camera, sim_config
+from dora.tasks.env.scene import TaskScene, film_camera, freeing_the_old_scene, sim_config
 from dora.tasks.env.state import saved_state, set_rows, unflattened
 from dora.tasks.env.task import Task
 from dora.tasks.guidance.guide import Guide
@@ -159,7 +159,8 @@ class DoraEnv(BaseEnv):
         """Builds the scene anew with objects of these relative sizes; begins new episodes."""
         self._forced_scale = scale
         try:
-            super().reset(options={"reconfigure": True})
+            with freeing_the_old_scene(self):
+                super().reset(options={"reconfigure": True})
         finally:
             self._forced_scale = None
 
@@ -243,7 +244,8 @@ class DoraEnv(BaseEnv):
         gym.Env.reset(self, seed=seeds[0] if isinstance(seeds, list) else seeds)  # gymnasium's own generator
         self._snapshot, self.resetting = None, True
         try:
-            return super().reset(seed=seeds, options=options)
+            with freeing_the_old_scene(self):
+                return super().reset(seed=seeds, options=options)
         finally:
             self.resetting = False
 

@@ -1,6 +1,8 @@
 """The scene of a task: table, objects with their properties, robots with their guides, and the reader of all that."""
 
-from collections.abc import Mapping, Sequence
+import gc
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -185,6 +187,21 @@ def _fitting(task: Task, arm: str, agent: DescribedRobot, grasps: GraspCandidate
     if not bool(adapted.valid.any()):
         raise InputError(f"{what} holds no valid grasp: give others (`dora grasps --object {obj.name}` makes some).")
     return adapted.select(adapted.valid)
+
+
+@contextmanager
+def freeing_the_old_scene(env: Any) -> Iterator[None]:
+    """A context in which an environment may build its scene anew.
+
+    ManiSkill collects the old scene while the task still holds parts of it. It would stay, and grow: PhysX tells every
+    scene of a friction that changes, and only those that are stepped forget it.
+    """
+    before = id(vars(env).get("scene"))
+    try:
+        yield
+    finally:
+        if id(vars(env).get("scene")) != before:
+            gc.collect()
 
 
 def sim_config(c: TaskConfig) -> SimConfig:
