@@ -258,6 +258,8 @@ def config_from_dict(content: Any, source: str = "the settings") -> RunConfig:
     task = content.get("task", {})
     if not isinstance(task, dict):
         raise InputError(f"{source} have numbers of the task that are no mapping, but {shown(task)}.")
+    if "randomisation" in task:  # all numbers are there, but one that later versions take from the preset
+        task = {"pose_filter": NEUTRAL["pose_filter"]} | task
     return dataclasses.replace(read, task=task, learner=learner)
 
 
