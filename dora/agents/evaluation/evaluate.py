@@ -91,7 +91,7 @@ class Evaluation:
 
     @property
     def success_at_end_rate(self) -> float:
-        """Share of episodes that succeed and in which what was reached holds in the last step, as far as the task says."""
+        """Share of episodes that succeed and hold in the last step what was reached, as far as the task says."""
         name = "success_at_end" if "success_at_end" in self.columns.last else "success"
         return float(self.values(name).mean())
 

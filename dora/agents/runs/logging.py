@@ -27,7 +27,7 @@ TAGS: dict[str, str] = {
     "final/penetration_p95_mm": "95th percentile of the largest penetration in the last evaluation [mm]",
     "training/success_rate": "share of this iteration's episodes that end in success",
     "training/raw_success_rate": "the same, overlap not counted",
-    "training/success_at_end_rate": "share of those episodes that succeed and in which what was reached still holds at the end",
+    "training/success_at_end_rate": "share of those episodes in whose last step what was reached still holds",
     "training/return_mean": "mean sum of rewards of those episodes",
     "training/length_mean": "mean length of those episodes [control steps]",
     "training/reward/<term>": "mean per control step of the reward term over those episodes, weight included",
