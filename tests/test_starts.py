@@ -112,8 +112,8 @@ def test_a_report_shows_success_against_the_start(tmp_path: Path):
     for seed in (0, 1):
         write_run(tmp_path / "runs" / str(seed), seed, 0.5, episodes=40)
         _write_episodes(tmp_path / "runs" / str(seed) / "eval.csv", error < 3.9, error)
-    _write_episodes(tmp_path / "runs" / "0" / "zero.csv", error < 2, error)
-    write_run(tmp_path / "runs" / "old", 3, 0.5, episodes=40)  # whose episodes do not say
+    _write_episodes(tmp_path / "runs" / "0" / "zero.csv", error > 4, error)
+    write_run(tmp_path / "runs" / "old", 3, 0.5, episodes=2)  # whose episodes do not say
     (tmp_path / "runs" / "old" / "eval.csv").write_text("episode,success\n0,1\n1,0\n")
     section = starts_section(find_runs(tmp_path / "runs"))
     assert [row[4] for row in section.rows] == ["candidate_error_mm"]  # the size is the same everywhere
