@@ -212,6 +212,7 @@ def test_policies_of_versions_without_numbers_mean_the_numbers_of_then(path: Pat
     task = find_task(config.env).CONFIG
     known = json.loads((path.parent / "result.json").read_text()).get("task_config")
     if known is not None:  # a later version, which says its numbers
+        known = {"pose_filter": NEUTRAL["pose_filter"]} | known
         assert task_config(task, config.preset, config.task) == task_config(task, config.preset, known)
         return
     first = yaml.safe_load(FIRST.read_text())
