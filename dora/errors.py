@@ -98,6 +98,7 @@ def command(body: Callable[P, int | None]) -> Callable[P, int]:
 
     @functools.wraps(body)
     def run(*args: P.args, **kwargs: P.kwargs) -> int:
+        """What `body` does, as an exit status."""
         try:
             return body(*args, **kwargs) or 0
         except InputError as error:

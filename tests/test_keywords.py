@@ -116,7 +116,11 @@ def test_numbers_of_numpy_are_taken():
     scene = {"enable_pcm": np.bool_(True), "contact_offset": np.float32(0.02)}
     config = {"sim_freq": np.int64(100), "scene_config": scene}
     options: Any = {"sim_backend": dora.sim.BACKEND, "render_backend": "none", "obs_mode": "state", "num_envs": 2}
-    gym.make("PickCube-v1", sim_config=config, **options).close()
+    env: Any = gym.make("PickCube-v1", sim_config=config, **options).unwrapped
+    found = env.sim_config
+    assert (found.sim_freq, found.scene_config.enable_pcm) == (100, True)
+    assert found.scene_config.contact_offset == pytest.approx(0.02)
+    env.close()
 
 
 @pytest.mark.parametrize("mode", ["state+pointcloud", "state_dict+rgb+pointcloud"])

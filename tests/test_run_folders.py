@@ -134,7 +134,9 @@ def test_shards_of_a_state_that_was_never_finished_are_written_anew(tmp_path: Pa
     newer = tmp_path / "run" / "checkpoints" / "replay" / "0000001024-0000001536.safetensors"
     newer.write_bytes(b"of a state whose checkpoint was not written")
     for total_steps in (1536, 2048):
-        run(tmp_path / "run", dataclasses.replace(SHORT_SAC, total_steps=total_steps), resume=True)
+        result = run(tmp_path / "run", dataclasses.replace(SHORT_SAC, total_steps=total_steps), resume=True)
+        assert result["env_steps"] == total_steps
+    assert len(load_file(newer)) > 0
 
 
 @pytest.mark.parametrize("left", ["curve.csv", "checkpoints/best.safetensors", "a link"])

@@ -105,13 +105,18 @@ def test_overlap_that_was_not_measured_is_no_fault(ours: Any):
     for name in ("episode.penetration", "episode.max_penetration"):
         state["memory"][name].fill_(torch.nan)
     ours.set_state_dict(state)
+    assert ours.memory.get_state()["episode.max_penetration"].isnan().all()
 
 
 def test_rows_that_a_mask_leaves_out_may_hold_anything(env: Any):
     env.reset(seed=0)
     state = env.get_state_dict()
     state["actors"]["cube"][0] = torch.nan
+    wanted = state["actors"]["cube"][1].clone()
     env.reset(options={"env_idx": torch.tensor([False, True]), START: {"env_states": state}})
+    found = env.get_state_dict()["actors"]["cube"]
+    assert found.isfinite().all()
+    assert torch.allclose(found[1], wanted, atol=1e-5)
 
 
 def test_a_state_of_another_size_replaces_one_that_is_unsound(ours: Any):
