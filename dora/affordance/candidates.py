@@ -203,7 +203,8 @@ class GraspCandidates:
 
         Args:
             what: that holds them, for the message.
-            object, robot: that they have to be of, if given.
+            object: that they have to be of, if given.
+            robot: that they have to be of, if given.
             stored: they say what they are of. Otherwise unknown digests are let pass, and another robot with the same
                 hand.
 
