@@ -123,8 +123,8 @@ def test_numbers_of_numpy_are_taken():
     env.close()
 
 
-@pytest.mark.parametrize("mode", ["state+pointcloud", "state_dict+rgb+pointcloud"])
-def test_observations_that_maniskill_joins_are_only_lacking_a_driver(mode: str):
+@pytest.mark.parametrize("mode", ["rgbd", "rgb", "pointcloud", "state+pointcloud", "state_dict+rgb+pointcloud"])
+def test_observations_of_maniskill_are_only_lacking_a_driver(mode: str):
     with pytest.raises(InputError, match="needs pictures"):
         gym.make("DoraCube-v1", obs_mode=mode, render_backend="none")
 

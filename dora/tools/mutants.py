@@ -22,6 +22,7 @@ from typing import Any
 import tyro
 
 from dora.errors import InputError, command
+from dora.parallel import name_leftovers, name_of_process
 from dora.progress import ProgressDisplay
 from dora.tables import text_table
 from dora.tools.mutation.sites import Mutant, mutants_of
@@ -177,7 +178,8 @@ def main() -> int:
     if args.list:
         print(text_table(HEAD, rows(mutants, {})))
         return 0
-    with tempfile.TemporaryDirectory(prefix="dora-mutants-") as folder:
+    name_leftovers()
+    with tempfile.TemporaryDirectory(prefix=name_of_process()) as folder:
         run = functools.partial(run_pytest, processes=args.processes)
         judge = Judge(copied(root, Path(folder)), args.limit, args.suite_limit if args.whole_suite else None, run)
         trials = judge_all(mutants, judge, args.out / FILE, args.again)
