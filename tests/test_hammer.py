@@ -16,7 +16,7 @@ from dora.geometry.rotations import (
 )
 from dora.tasks.hammer import mdp
 from dora.tasks.hammer.ballistics import Strike, after_fall, arrival, fall_time, slid
-from dora.tasks.hammer.reference import ALIGN, REST, CatchReference, CatchSettings
+from dora.tasks.hammer.reference import ALIGN, REST, SWING, CatchReference, CatchSettings, Timing, phases
 from dora.tasks.hammer.snapshot import HAND_CENTRE, HammerSnapshot, face_to_nail, handle_distance, misalignment
 from dora.tasks.hammer.task import UNKNOWN, HammerConfig
 
@@ -202,6 +202,19 @@ def test_the_residual_has_its_bounds_until_the_hammer_is_held_and_a_share_of_the
     reference = CatchReference(REST + 1, strike, CONFIG.nail.driven, 0.025, "cpu", settings)
     reference.phase.index.copy_(torch.arange(REST + 1))
     assert reference.freedom().tolist() == [1.0] * ALIGN + [0.25] * (REST + 1 - ALIGN)
+
+
+@pytest.mark.parametrize(
+    ("beyond", "driven", "done", "lost"),
+    [(-0.01, False, False, False), (-0.01, True, False, False), (0.01, False, False, True), (0.01, True, True, False)],
+)
+def test_a_blow_is_followed_by_another_until_the_nail_is_in(beyond: float, driven: bool, done: bool, lost: bool):
+    settings = CatchSettings()
+    swing = phases(settings)[SWING]
+    spent = torch.tensor([settings.swing_time + settings.dwell + beyond])
+    t = Timing(torch.zeros(1), spent, torch.zeros(1), torch.zeros(1), torch.tensor([driven]))
+    assert swing.lost is not None
+    assert (swing.done(t).item(), swing.lost(t).item(), swing.back_to) == (done, lost, "raise")
 
 
 # ---------------------------------------------------------------------- solution
