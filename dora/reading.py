@@ -1,4 +1,5 @@
 """Bounded reading of plain files: bytes, text, JSON, YAML, TOML, XML and arrays; what does not fit is an `InputError`.
+`TomlTables` checks the values of a description in TOML.
 
 A file is refused by its size before it is read, and what it holds by its depth and its number of values before anything
 is made of it. So no file costs more than a few seconds and a few hundred megabytes.
@@ -12,7 +13,7 @@ import json
 import math
 import tomllib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -20,7 +21,7 @@ from xml.parsers import expat
 import numpy as np
 import yaml
 
-from dora.errors import InputError
+from dora.errors import InputError, shown
 
 MOST_TEXT = 8_000_000
 """Size of a text file above which it is not read, where nothing else is said [bytes]."""
@@ -275,3 +276,80 @@ def read_array(path: Path, what: str, most: int) -> np.ndarray:
         if ((codes > LAST_CHARACTER) | ((codes >= 0xD800) & (codes <= 0xDFFF))).any():
             raise InputError(f"{path} holds texts with codes that are no characters: write it again.")
     return np.frombuffer(content, kind, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
+
+
+LARGEST_NUMBER = 1e9
+"""Every number of a description in TOML is smaller, in SI units; limits of effort and stiffness included."""
+LONGEST_TEXT = 200
+"""Largest number of characters of a name or text of such a description [1]."""
+
+Table = dict[str, Any]
+"""A table of a TOML file."""
+Keys = Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]
+"""Required and optional keys by kind of table."""
+
+
+class TomlTables:
+    """Checks values of one file; each check returns the value, or raises an InputError that names the file.
+
+    Args:
+        path: of the file.
+        known: keys that each kind of table has.
+    """
+
+    def __init__(self, path: Path, known: Keys) -> None:
+        self.path, self._known = path, known
+
+    def fail(self, text: str) -> InputError:
+        """The error that says what is wrong in the file."""
+        return InputError(f"{self.path}: {text}")
+
+    def table(self, value: Any, where: str) -> Table:
+        """A table."""
+        if not isinstance(value, dict):
+            raise self.fail(f"{where} must be a table.")
+        return value
+
+    def keys(self, value: Any, kind: str, where: str) -> Table:
+        """A table of a kind, without unknown keys, and with those that are required."""
+        required, optional = self._known[kind]
+        table = self.table(value, where)
+        for key in table:
+            if key not in required + optional:
+                raise self.fail(f"{where} has the unknown key {shown(key)}; known: {', '.join(required + optional)}.")
+        for key in required:
+            if key not in table:
+                raise self.fail(f"{where} lacks the key {key!r}; add it.")
+        return table
+
+    def text(self, value: Any, where: str, printable: bool = False) -> str:
+        """A text that is neither empty nor long, and can be printed if that is asked for."""
+        if not isinstance(value, str) or not 0 < len(value) <= LONGEST_TEXT or (printable and not value.isprintable()):
+            words = (
+                f"a text that can be printed, of 1 to {LONGEST_TEXT}" if printable else f"a text of 1 to {LONGEST_TEXT}"
+            )
+            raise self.fail(f"{where} must be {words} characters.")
+        return value
+
+    def one_of(self, value: Any, known: tuple[str, ...], where: str) -> Any:
+        """One of the known values."""
+        if value not in known:
+            raise self.fail(f"{where} is {shown(value)}; choose one of: {', '.join(known)}.")
+        return value
+
+    def numbers(self, value: Any, length: int, where: str) -> tuple[float, ...]:
+        """Finite numbers in a list of this length."""
+        if not isinstance(value, list) or len(value) != length:
+            raise self.fail(f"{where} must be a list of {length} numbers.")
+        if not all(isinstance(each, int | float) and not isinstance(each, bool) for each in value):
+            raise self.fail(f"{where} must be numbers.")
+        if not all(abs(each) < LARGEST_NUMBER for each in value):
+            raise self.fail(f"{where} must be finite numbers below {LARGEST_NUMBER:g}.")
+        return tuple(float(each) for each in value)
+
+    def positive(self, value: Any, where: str) -> float:
+        """A positive number."""
+        (number,) = self.numbers([value], 1, where)
+        if number <= 0:
+            raise self.fail(f"{where} is {number}; it must be positive.")
+        return number

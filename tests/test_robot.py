@@ -317,7 +317,7 @@ SPOILED = {
         TOML,
         "pad = [-0.007, 0.025, 0.0]",
         "pad = [0.025, 0.0]",
-        "pad needs 3 numbers and has 2",
+        "pad must be a list of 3 numbers",
     ),
     "not a number": (TOML, "armature = 5e-4", "armature = nan", "armature must be finite"),
     "a word": (TOML, "armature = 5e-4", 'armature = "big"', "armature must be numbers"),

@@ -13,7 +13,7 @@ import numpy as np
 
 import dora
 from dora.errors import InputError, shown, suggestion
-from dora.reading import entries, read_toml
+from dora.reading import Table, TomlTables, entries, read_toml
 from dora.robot.description import Contact, Coupling, Finger, JointGroup, Posture, RobotDescription
 from dora.robot.urdf import UrdfModel, read_urdf
 
@@ -22,13 +22,6 @@ ROBOT_FILE = "robot.toml"
 SEARCH_VARIABLE = "DORA_ROBOTS"
 """Environment variable with further folders of robots, separated as in PATH."""
 
-Table = dict[str, Any]
-"""A table of a TOML file."""
-
-LARGEST_NUMBER = 1e9
-"""Every number of a robot is smaller, in SI units; limits of effort and stiffness included."""
-LONGEST_NAME = 200
-"""Largest number of characters of a name [1]."""
 KEYS = {
     "robot.toml": (
         ("name", "urdf", "wrist_link", "palm_link", "tip_radius", "arm", "hand", "fingers", "postures", "contact"),
@@ -87,20 +80,19 @@ class _Reader:
 
     def __init__(self, path: Path, model: UrdfModel) -> None:
         self.path, self.model = path, model
-
-    def fail(self, text: str) -> InputError:
-        return InputError(f"{self.path}: {text}")
+        self.check = TomlTables(path, KEYS)
+        self.fail = self.check.fail
 
     def robot(self, content: Table) -> RobotDescription:
         """The whole description; InputError for the first value that does not fit."""
-        self.keys(content, "robot.toml", "the file")
+        self.check.keys(content, "robot.toml", "the file")
         arm, hand = self.group(content["arm"], "arm"), self.group(content["hand"], "hand")
         twice = set(arm.names) & set(hand.names)
         if twice:
             raise self.fail(f"joint {min(twice)!r} is both in arm and hand; keep it in one of them.")
         shapes = {link: shapes for link, shapes in self.model.shapes.items() if shapes}
         return RobotDescription(
-            name=self.text(content["name"], "name"),
+            name=self.check.text(content["name"], "name", printable=True),
             folder=self.path.parent,
             urdf=self.path.parent / content["urdf"],
             model=self.model,
@@ -109,62 +101,30 @@ class _Reader:
             couplings=self.couplings(content.get("coupling", []), hand),
             wrist_link=self.link(content["wrist_link"]),
             palm_link=self.link(content["palm_link"]),
-            tip_radius=self.length(content["tip_radius"], "tip_radius"),
-            fingers={n: self.finger(n, row, hand) for n, row in self.table(content["fingers"], "fingers").items()},
+            tip_radius=self.check.positive(content["tip_radius"], "tip_radius"),
+            fingers={
+                n: self.finger(n, row, hand) for n, row in self.check.table(content["fingers"], "fingers").items()
+            },
             postures={
-                n: self.posture(n, row, arm, hand) for n, row in self.table(content["postures"], "postures").items()
+                n: self.posture(n, row, arm, hand)
+                for n, row in self.check.table(content["postures"], "postures").items()
             },
             shapes=shapes,
             contacts=self.contacts(content["contact"], shapes),
             ignored_pairs=self.pairs(content.get("no_collision", {}), shapes),
         )
 
-    def keys(self, table: Any, kind: str, where: str) -> None:
-        """Refuses unknown and missing keys of a table."""
-        required, optional = KEYS[kind]
-        for key in self.table(table, where):
-            if key not in required + optional:
-                raise self.fail(f"{where} has the unknown key {shown(key)}; known: {', '.join(required + optional)}.")
-        for key in required:
-            if key not in table:
-                raise self.fail(f"{where} lacks the key {key!r}; add it.")
-
-    def table(self, value: Any, where: str) -> Table:
-        if not isinstance(value, dict):
-            raise self.fail(f"{where} must be a table.")
-        return value
-
-    def text(self, value: Any, where: str) -> str:
-        if not isinstance(value, str) or not 0 < len(value) <= LONGEST_NAME or not value.isprintable():
-            raise self.fail(f"{where} must be a text that can be printed, of 1 to {LONGEST_NAME} characters.")
-        return value
-
     def link(self, name: Any) -> str:
         if not isinstance(name, str) or name not in self.model.links:
             raise self.fail(f"the URDF has no link {shown(name)}; correct the name.")
         return name
 
-    def numbers(self, value: Any, length: int, where: str) -> np.ndarray:
+    def array(self, value: Any, length: int, where: str) -> np.ndarray:
         """A float64 array of this length; a single number stands for all."""
-        entries = value if isinstance(value, list) else [value]
-        if not all(isinstance(each, int | float) and not isinstance(each, bool) for each in entries):
-            raise self.fail(f"{where} must be numbers.")
-        if not all(abs(each) < LARGEST_NUMBER for each in entries):
-            raise self.fail(f"{where} must be finite numbers below {LARGEST_NUMBER:g}.")
-        array = np.array(value, dtype=np.float64)
-        if array.ndim == 0:
-            array = np.full(length, array)
-        if array.shape != (length,):
-            raise self.fail(f"{where} needs {length} numbers and has {array.size}.")
+        entries = value if isinstance(value, list) else [value] * length
+        array = np.array(self.check.numbers(entries, length, where))
         array.flags.writeable = False
         return array
-
-    def length(self, value: Any, where: str) -> float:
-        """A positive length [m]."""
-        number = float(self.numbers(value, 1, where)[0])
-        if number <= 0:
-            raise self.fail(f"{where} must be a positive length in metres, not {number:g}.")
-        return number
 
     def names(self, names: Any, where: str) -> tuple[str, ...]:
         if not isinstance(names, list) or not all(isinstance(n, str) for n in names) or len(set(names)) != len(names):
@@ -173,18 +133,18 @@ class _Reader:
 
     def group(self, table: Any, name: str) -> JointGroup:
         """A joint group with limits from the URDF [rad, rad/s, N m] and gains from the table."""
-        self.keys(table, "joint group", name)
+        self.check.keys(table, "joint group", name)
         names = self.names(table["joints"], f"{name}.joints")
         for joint in names:
             if joint not in self.model.joints or not self.model.joints[joint].moves:
                 raise self.fail(f"the URDF has no moving joint {joint!r}, which {name}.joints names.")
         joints = [self.model.joints[joint] for joint in names]
         limits = {
-            key: self.numbers([getattr(joint, key) for joint in joints], len(names), f"{name} {key}")
+            key: self.array([getattr(joint, key) for joint in joints], len(names), f"{name} {key}")
             for key in ("lower", "upper", "velocity", "effort")
         }
         gains = {
-            key: self.numbers(table[key], len(names), f"{name}.{key}") for key in ("stiffness", "damping", "armature")
+            key: self.array(table[key], len(names), f"{name}.{key}") for key in ("stiffness", "damping", "armature")
         }
         for key in ("velocity", "effort"):
             if (limits[key] <= 0).any():
@@ -210,30 +170,30 @@ class _Reader:
 
     def coupling(self, table: Any, hand: JointGroup) -> Coupling:
         """One coupling, its joints as indices into the hand group."""
-        self.keys(table, "coupling", "a coupling")
+        self.check.keys(table, "coupling", "a coupling")
         for key in ("follower", "leader"):
             if not isinstance(table[key], str) or table[key] not in hand.names:
                 raise self.fail(f"the {key} {shown(table[key])} of a coupling is not a joint of the hand.")
-        factors = self.numbers([table["multiplier"], table["offset"]], 2, "a coupling's multiplier and offset")
+        factors = self.array([table["multiplier"], table["offset"]], 2, "a coupling's multiplier and offset")
         follower, leader = (hand.names.index(table[key]) for key in ("follower", "leader"))
         return Coupling(follower, leader, *factors.tolist())
 
     def finger(self, name: str, table: Any, hand: JointGroup) -> Finger:
         """One finger; `pad` is a point (3,) in its distal link's frame [m]."""
-        self.keys(table, "finger", f"fingers.{name}")
+        self.check.keys(table, "finger", f"fingers.{name}")
         joints = self.names(table["joints"], f"fingers.{name}.joints")
         for joint in joints:
             if joint not in hand.names:
                 raise self.fail(f"fingers.{name}: {joint!r} is not a joint of the hand.")
         links = {key: self.link(table[key]) for key in ("proximal", "medial", "distal", "tip")}
-        return Finger(name, joints, **links, pad=self.numbers(table["pad"], 3, f"fingers.{name}.pad"))
+        return Finger(name, joints, **links, pad=self.array(table["pad"], 3, f"fingers.{name}.pad"))
 
     def posture(self, name: str, table: Any, arm: JointGroup, hand: JointGroup) -> Posture:
         """A named posture (n_arm,), (n_hand,) [rad] within the joint limits."""
-        self.keys(table, "posture", f"postures.{name}")
+        self.check.keys(table, "posture", f"postures.{name}")
         angles = {}
         for key, group in (("arm", arm), ("hand", hand)):
-            angles[key] = self.numbers(table[key], len(group), f"postures.{name}.{key}")
+            angles[key] = self.array(table[key], len(group), f"postures.{name}.{key}")
             outside = (angles[key] < group.lower) | (angles[key] > group.upper)
             if outside.any():
                 joint = group.names[int(np.argmax(outside))]
@@ -243,10 +203,10 @@ class _Reader:
     def contacts(self, groups: Any, shapes: Iterable[str]) -> dict[str, Contact]:
         """Contact settings by link; InputError if a link with shapes has none or two."""
         found: dict[str, Contact] = {}
-        for name, table in self.table(groups, "contact").items():
-            self.keys(table, "contact group", f"contact.{name}")
+        for name, table in self.check.table(groups, "contact").items():
+            self.check.keys(table, "contact group", f"contact.{name}")
             values = {key: table[key] for key in table if key != "links"}
-            contact = Contact(*self.numbers(
+            contact = Contact(*self.array(
                 [values[key] for key in KEYS["contact group"][0][1:]], 4, f"contact.{name}"
             ).tolist())  # fmt: skip
             for link in map(self.link, self.names(table["links"], f"contact.{name}.links")):
@@ -261,7 +221,7 @@ class _Reader:
     def pairs(self, table: Any, shapes: Iterable[str]) -> frozenset[tuple[str, str]]:
         """Link pairs of `no_collision`; links joined by one joint, or by fixed joints, are added."""
         pairs = set()
-        for link, others in self.table(table, "no_collision").items():
+        for link, others in self.check.table(table, "no_collision").items():
             for other in self.names(others, f"no_collision.{link}"):
                 if link == other:
                     raise self.fail(f"no_collision.{link} names the link itself; remove it.")

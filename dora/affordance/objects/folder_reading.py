@@ -25,17 +25,15 @@ from dora.affordance.objects.affordance_object import (
 from dora.affordance.objects.importing import LARGEST, SMALLEST
 from dora.affordance.objects.mesh_files import LABEL, read_ply
 from dora.errors import InputError, shown
-from dora.reading import read_toml
+from dora.reading import Table, TomlTables, read_toml
 from dora.robot.shapes import Shape
 
 OBJECT_FILE = "object.toml"
 """Name of the file of an object's folder that says what the object is."""
 FORMAT = "dora-object 1"
 """Format and version of an object's folder."""
-MOST_PIECES, LONGEST_TEXT = 1000, 200
-"""Largest number of tables in a list, and of characters in a text [1]."""
-LARGEST_NUMBER = 1e9
-"""Every number of the file is smaller, in SI units."""
+MOST_PIECES = 1000
+"""Largest number of tables in a list [1]."""
 FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*\.ply")
 """Names of mesh files: plain, so that they lie in the folder itself."""
 SIZES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}
@@ -57,8 +55,6 @@ KEYS = {
 RESERVED = ("joints", "links")
 """Keys kept for objects of several bodies."""
 
-Table = dict[str, Any]
-
 
 def read_object_folder(folder: Path) -> AffordanceObject:
     """The object of a folder, with every number as it is written there (docs/objects.md has the format).
@@ -74,9 +70,8 @@ class _Reader:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.path = folder, folder / OBJECT_FILE
-
-    def fail(self, text: str) -> InputError:
-        return InputError(f"{self.path}: {text}")
+        self.check = TomlTables(self.path, KEYS)
+        self.fail = self.check.fail
 
     def content(self) -> Table:
         """The tables of the file, with known keys alone."""
@@ -88,7 +83,7 @@ class _Reader:
                 raise self.fail(
                     f"{key!r} belongs into articulation.toml, which says what the object is mounted on; move it there."
                 )
-        self.keys(content, "object", "the file")
+        self.check.keys(content, "object", "the file")
         if content["format"] != FORMAT:
             raise self.fail(f"the format is {shown(content['format'])}, not {FORMAT!r}; write the folder again.")
         if content["name"] != self.folder.name:
@@ -109,66 +104,28 @@ class _Reader:
             face_labels=labels,
             labels=names,
             classes=classes,
-            target=self.one_of(content["target"], names, "target"),
+            target=self.check.one_of(content["target"], names, "target"),
             solid=self.closed(content["solid"])[0] if "solid" in content else mesh,
-            mass=self.positive(content["mass"], "mass"),
+            mass=self.check.positive(content["mass"], "mass"),
             inertia=self.inertia(content["inertia"]),
             pieces=self.pieces(content["pieces"], names),
             support=support_height(mesh, rest),
             rest=rest,
             digest=surface_digest(mesh, labels, names),
-            friction=self.positive(content.get("friction", FRICTION), "friction"),
-            placement=self.one_of(content.get("placement", "table"), get_args(Placement), "placement"),
-            start_posture=self.text(content.get("start_posture", HOME), "start_posture"),
+            friction=self.check.positive(content.get("friction", FRICTION), "friction"),
+            placement=self.check.one_of(content.get("placement", "table"), get_args(Placement), "placement"),
+            start_posture=self.check.text(content.get("start_posture", HOME), "start_posture"),
             folder=self.folder,
         )
-
-    def keys(self, table: Any, kind: str, where: str) -> None:
-        """Refuses unknown and missing keys of a table."""
-        if not isinstance(table, dict):
-            raise self.fail(f"{where} must be a table.")
-        required, optional = KEYS[kind]
-        for key in table:
-            if key not in required + optional:
-                raise self.fail(f"{where} has the unknown key {shown(key)}; known: {', '.join(required + optional)}.")
-        for key in required:
-            if key not in table:
-                raise self.fail(f"{where} lacks the key {key!r}; add it.")
-
-    def text(self, value: Any, where: str) -> str:
-        if not isinstance(value, str) or not 0 < len(value) <= LONGEST_TEXT:
-            raise self.fail(f"{where} must be a text that is not empty, of at most {LONGEST_TEXT} characters.")
-        return value
-
-    def one_of(self, value: Any, known: tuple[str, ...], where: str) -> Any:
-        if value not in known:
-            raise self.fail(f"{where} is {shown(value)}; choose one of: {', '.join(known)}.")
-        return value
 
     def rows(self, value: Any, where: str) -> list[Any]:
         if not isinstance(value, list) or not 0 < len(value) <= MOST_PIECES:
             raise self.fail(f"[[{where}]] must have at least one table, and at most {MOST_PIECES}.")
         return value
 
-    def numbers(self, value: Any, length: int, where: str) -> tuple[float, ...]:
-        """Finite numbers in a list of this length."""
-        if not isinstance(value, list) or len(value) != length:
-            raise self.fail(f"{where} must be a list of {length} numbers.")
-        if not all(isinstance(each, int | float) and not isinstance(each, bool) for each in value):
-            raise self.fail(f"{where} must be numbers.")
-        if not all(abs(each) < LARGEST_NUMBER for each in value):
-            raise self.fail(f"{where} must be finite numbers below {LARGEST_NUMBER:g}.")
-        return tuple(float(each) for each in value)
-
-    def positive(self, value: Any, where: str) -> float:
-        (number,) = self.numbers([value], 1, where)
-        if number <= 0:
-            raise self.fail(f"{where} is {number}; it must be positive.")
-        return number
-
     def quaternion(self, value: Any, where: str) -> tuple[float, float, float, float]:
         """A unit quaternion (wxyz)."""
-        w, x, y, z = self.numbers(value, 4, where)
+        w, x, y, z = self.check.numbers(value, 4, where)
         if not abs(math.sqrt(w * w + x * x + y * y + z * z) - 1) < UNIT:
             raise self.fail(f"{where} must be a quaternion (w, x, y, z) of norm 1.")
         return w, x, y, z
@@ -177,7 +134,7 @@ class _Reader:
         """An inertia [kg m^2] that a body can have: symmetric, no principal moment above the sum of the others."""
         if not isinstance(value, list) or len(value) != 3:
             raise self.fail("inertia must be a list of 3 lists of 3 numbers.")
-        found = np.array([self.numbers(row, 3, "each row of inertia") for row in value])
+        found = np.array([self.check.numbers(row, 3, "each row of inertia") for row in value])
         slack = SYMMETRY * np.abs(found).max()
         if np.abs(found - found.T).max() > slack:
             raise self.fail("inertia must be symmetric.")
@@ -190,9 +147,9 @@ class _Reader:
         """Names of the regions and their grasp classes, in the order of the file."""
         names, classes = [], []
         for row in self.rows(value, "regions"):
-            self.keys(row, "region", "a region")
-            names.append(self.text(row["name"], "the name of a region"))
-            classes.append(self.text(row["grasp_class"], f"grasp_class of {shown(row['name'])}"))
+            self.check.keys(row, "region", "a region")
+            names.append(self.check.text(row["name"], "the name of a region"))
+            classes.append(self.check.text(row["grasp_class"], f"grasp_class of {shown(row['name'])}"))
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
             raise self.fail(f"two regions are named {twice!r}; rename one of them.")
@@ -238,16 +195,16 @@ class _Reader:
 
     def piece(self, row: Any, regions: tuple[str, ...], where: str) -> Piece:
         """One collision shape: a primitive, or the file of a convex hull."""
-        self.keys(row, "hull" if isinstance(row, dict) and "mesh" in row else "primitive", where)
-        region = self.one_of(row["region"], regions, f"the region of {where}")
+        self.check.keys(row, "hull" if isinstance(row, dict) and "mesh" in row else "primitive", where)
+        region = self.check.one_of(row["region"], regions, f"the region of {where}")
         if "mesh" in row:
             hull, _ = self.mesh(row["mesh"])
             if not hull.is_convex:
                 raise InputError(f"{self.folder / row['mesh']} is not convex: cut it into convex pieces.")
             return Piece(region, hull)
-        kind = self.one_of(row["shape"], tuple(SIZES), f"the shape of {where}")
-        x, y, z = self.numbers(row["position"], 3, f"the position of {where}")
-        size = self.numbers(row["size"], SIZES[kind], f"the size of {where}")
+        kind = self.check.one_of(row["shape"], tuple(SIZES), f"the shape of {where}")
+        x, y, z = self.check.numbers(row["position"], 3, f"the position of {where}")
+        size = self.check.numbers(row["size"], SIZES[kind], f"the size of {where}")
         if min(size) <= 0:
             raise self.fail(f"the size of {where} must be positive.")
         return Piece(
