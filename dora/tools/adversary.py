@@ -9,6 +9,7 @@ value of the info is not finite, or if memory grows.
 
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.errors import command
+from dora.progress import ProgressDisplay
 from dora.sim import BACKEND
 from dora.tasks import task_ids
 
@@ -75,13 +77,16 @@ def extreme_actions(step: int, shape: tuple[int, int], generator: torch.Generato
     return action
 
 
-def attack(env: Any, steps: int, seed: int = 0) -> Report:
+def attack(
+    env: Any, steps: int, seed: int = 0, progress: Callable[[int, int], None] = lambda done, total: None
+) -> Report:
     """Step an unwrapped batched environment with `extreme_actions`, restarting episodes that end.
 
     Args:
         env: of any id, on the batched back end, with `obs_mode="state"`.
         steps: environment steps in all.
         seed: of the first episodes and of the random actions.
+        progress: called with the environment steps done, and all of them.
     """
     generator = torch.Generator().manual_seed(seed)
     env.reset(seed=seed)
@@ -101,6 +106,7 @@ def attack(env: Any, steps: int, seed: int = 0) -> Report:
             bad += int((~env.reset(options={"env_idx": ended})[0].isfinite().all(1)).sum())
         if step == int(WARM_UP * rounds):
             first = memory()
+        progress((step + 1) * env.num_envs, rounds * env.num_envs)
     return Report(rounds * env.num_envs, episodes, nonfinite, bad, (first, memory()), time.monotonic() - start)
 
 
@@ -131,7 +137,8 @@ def main() -> int:
     for name in args.envs:
         options: Any = {"num_envs": args.num_envs, "sim_backend": BACKEND, "render_backend": "none"}
         env: Any = gym.make(name, obs_mode="state", **options).unwrapped
-        report = attack(env, args.steps, args.seed)
+        with ProgressDisplay() as display:
+            report = attack(env, args.steps, args.seed, display.phase(name, "steps"))
         print(f"{name}: {report}", flush=True)
         good &= report.good
         env.close()
