@@ -198,8 +198,8 @@ def test_each_arm_observes_the_microwave_from_its_hand():
     """The hand is turned by a right angle about the vertical, the microwave by `YAW`."""
     turn, p = turned(np.pi / 2), torch.tensor([[0.1, 0.2, 0.3]] * 2)
     hand = {"wrist_p": p, "wrist_q": turn}
-    door = {"door": torch.tensor([0.0, 1.2]), "door_speed": torch.tensor([0.0, -0.5])}
-    s = two_arms(hand, hand, cube={"p": in_world(0.1, -0.02, 0.04)}, **door).of(RIGHT)
+    door, speed = torch.tensor([0.0, 1.2]), torch.tensor([0.0, -0.5])
+    s = two_arms(hand, hand, cube={"p": in_world(0.1, -0.02, 0.04)}, door=door, door_speed=speed).of(RIGHT)
     quarter = rotation(turn).inv()
     np.testing.assert_allclose(OF_MICROWAVE["oven"].value(s), quarter.apply(np.array(OVEN) - p.numpy()), atol=1e-6)
     ahead = [[np.cos(YAW), np.sin(YAW), 0.0]] * 2
