@@ -132,3 +132,38 @@ def test_no_term_leaves_its_bounds():
         for name, term in TERMS.items():
             value = term.value(s)
             assert ((value >= 0) & (value <= 1)).all(), name
+
+
+THUMB_AND_INDEX, TWO_FINGERS = torch.tensor([0, 1]), torch.tensor([1, 2])
+FAR_AND_NEAR = torch.tensor([[0.0, 0.0, 0.4], [0.0, 0.0, 0.2]])
+OF_EACH_ARM: dict[str, tuple[dict[str, Any], dict[str, Any], int]] = {
+    "affordance": ({"tip_p": FAR_AND_NEAR[:, None].repeat(1, 5, 1)}, {}, 0),
+    "candidate": ({}, {"p": FAR_AND_NEAR}, 0),
+    "reach": ({"tip_p": FAR_AND_NEAR[:, None].repeat(1, 5, 1)}, {}, 0),
+    "grasp": ({"touch": torch.zeros(2, 6, dtype=torch.bool)}, {}, 1),
+}
+"""Two states of a hand and of its goal of which the second is better, and the stage in which the term pays."""
+OF_EACH_ARM["grasp"][0]["touch"][0, TWO_FINGERS] = True
+OF_EACH_ARM["grasp"][0]["touch"][1, THUMB_AND_INDEX] = True
+
+
+@pytest.mark.parametrize("arm", [LEFT, RIGHT])
+@pytest.mark.parametrize("name", OF_EACH_ARM)
+def test_reaching_and_grasping_pay_the_arm_that_does_it(arm: str, name: str):
+    hand, goal, stage = OF_EACH_ARM[name]
+    stages = {each: torch.full((2,), stage) for each in (LEFT, RIGHT)}
+    s = invented(**{arm: hand}, goals={arm: goal}, stages=stages)  # pyright: ignore[reportArgumentType]
+    other = LEFT if arm == RIGHT else RIGHT
+    term = TERMS[f"{name}_{arm}"]
+    worse, better = term.value(s).tolist()
+    assert worse < better - 1e-4
+    assert term.weight > 0
+    unmoved = TERMS[f"{name}_{other}"].value(s)
+    assert unmoved[0] == unmoved[1]
+
+
+def test_overlap_costs_in_every_stage():
+    """`penetration` is a penalty of every task; the first state overlaps less."""
+    less, more = TERMS["penetration"].value(invented(penetration=torch.tensor([0.002, 0.004]))).tolist()
+    assert less < more
+    assert TERMS["penetration"].weight < 0
