@@ -3,9 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import radians
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
+import tyro
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -88,6 +89,8 @@ class MicrowaveWeights(PenaltyWeights):
 class MicrowaveConfig(TaskConfig):
     """Numbers of the task."""
 
+    definition: Annotated[int, tyro.conf.Suppress] = 2
+    """2: the door is opened by a finger on the handle, and the cube is left with both hands outside (November 2026)."""
     PRESETS: ClassVar[Any] = {
         "none": MicrowaveRandomisation(),
         "standard": MicrowaveRandomisation(
