@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from fake_task import PointMass
+from scipy.spatial.transform import Rotation
 from test_report import write_run
 
 import dora  # noqa: F401  (registers the tasks)
@@ -56,6 +57,22 @@ def test_the_error_of_the_candidate_is_within_the_presets_bounds(env):
             assert (value <= bound).all()
         assert value.shape == (4,)
     assert any(name.startswith("candidate_error_mm") for name in env.start_numbers)
+
+
+def test_the_error_of_the_candidate_is_how_far_the_used_one_is_from_the_stored_one(env):
+    """In millimetres and degrees, by another library."""
+    env.reset(seed=[1, 2, 3, 4])
+    for name, choice in env.arms.choices.items():
+        end = f"_{name}" if len(env.arms) > 1 else ""
+        chosen, used = choice.buffers.chosen.long(), choice.buffers
+        away = np.linalg.norm((used.position[:, 0] - choice.candidates.position[chosen]).numpy(), axis=-1)
+        np.testing.assert_allclose(env.start_numbers[f"candidate_error_mm{end}"], 1000 * away, rtol=1e-4)
+        stored, found = (
+            Rotation.from_quat(q.numpy(), scalar_first=True)
+            for q in (choice.candidates.quaternion[chosen], used.quaternion[:, 0])
+        )
+        turn = np.degrees((stored.inv() * found).magnitude())
+        np.testing.assert_allclose(env.start_numbers[f"candidate_error_deg{end}"], turn, atol=0.05)
 
 
 def test_without_randomisation_there_is_no_error():
