@@ -7,12 +7,14 @@ import torch
 from invented import extension
 from torch import Tensor
 
+import dora
 import dora.tasks as tasks
-from dora.geometry.poses import compose
+from dora.geometry.poses import compose, relative
 from dora.geometry.rotations import (
     quaternion_apply,
     quaternion_from_rotation_vector,
     quaternion_multiply,
+    rotation_angle,
 )
 from dora.tasks.hammer import mdp
 from dora.tasks.hammer.ballistics import Strike, after_fall, arrival, fall_time, slid
@@ -218,6 +220,30 @@ def test_a_blow_is_followed_by_another_until_the_nail_is_in(beyond: float, drive
 
 
 # ---------------------------------------------------------------------- solution
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("learned", [False, True], ids=["script", "policy"])
+def test_between_catch_and_blow_the_wrist_turns_the_hammer(learned: bool):
+    """Medians over the starts in which the stage `orient` was done."""
+    starts = 64
+    task = tasks.make_task("DoraHammer-v1", starts)
+    policy = dora.load_policy("DoraHammer-v1") if learned else lambda obs: torch.zeros(starts, task.action_size)
+    observation = task.reset(seed=30_000)[0]
+    before, turned = torch.full((2, starts, 4), float("nan")), torch.full((2, starts), float("nan"))
+    for _ in range(task.max_steps):
+        s = task.snapshot
+        now = torch.stack([relative((s.hand.wrist_p, s.hand.wrist_q), (s.object.p, s.object.q))[1], s.object.q])
+        begins = (s.stage >= mdp.ORIENT) & before[0, :, 0].isnan()
+        before[:, begins] = now[:, begins]
+        ends = (s.stage >= mdp.STRIKE) & turned[0].isnan()
+        turned[:, ends] = rotation_angle(before[:, ends].flatten(0, 1), now[:, ends].flatten(0, 1)).view(2, -1)
+        observation = task.step(policy(observation))[0]
+    in_hand, in_world = turned.nanmedian(-1).values.tolist()
+    print(f"{turned[0].isfinite().sum()} of {starts}: {in_hand:.3f} rad in the hand, {in_world:.2f} in the world")
+    assert in_hand < 0.15
+    assert in_world > 1.4
+    task.close()
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 from dora.integrations.sb3 import make
 from stable_baselines3 import PPO
 
-PPO("MlpPolicy", make("DoraCube-v1", num_envs=64)).learn(300_000)
+PPO("MlpPolicy", make("DoraCube-v1", num_envs=64, ignore_terminations=True)).learn(300_000)
 """
 
 from collections.abc import Sequence

@@ -3,7 +3,8 @@
 from dora.integrations.torchrl import make
 from torchrl.collectors import Collector
 
-collector = Collector(make("DoraCube-v1", num_envs=64), frames_per_batch=1024, total_frames=300_000)
+env = make("DoraCube-v1", num_envs=64, ignore_terminations=True)
+collector = Collector(env, frames_per_batch=1024, total_frames=300_000)
 """
 
 from typing import Any
