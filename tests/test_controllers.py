@@ -110,3 +110,21 @@ def test_no_action_stops_a_wrist_whose_drives_are_told_velocities():
     task.step(None)
     assert told() == 0.0
     task.close()
+
+
+def test_what_an_episode_begins_with_is_commanded_and_other_resets_command_what_is_measured(task: DoraEnv):
+    """Of a reset of two environments, which `begin` is told about, and of one without it."""
+    task.reset(seed=0)
+    controller = task.agent.wrist_controller
+    held = controller.target.clone()
+    joints, rows = controller.target[:2] + 0.02, torch.tensor([1, 3])
+    controller.begin(rows, joints)
+    controller.reset()
+    torch.testing.assert_close(controller.target[rows], joints, atol=0, rtol=0)
+    torch.testing.assert_close(controller.target[[0, 2]], held[[0, 2]], atol=0, rtol=0)
+    controller.expect_reset(torch.tensor([False, True, False, False]))
+    controller.reset()
+    torch.testing.assert_close(controller.target[1], controller.qpos[1], atol=0, rtol=0)
+    torch.testing.assert_close(controller.target[3], joints[1], atol=0, rtol=0)
+    controller.reset()
+    torch.testing.assert_close(controller.target, controller.qpos, atol=0, rtol=0)
