@@ -1,20 +1,24 @@
 """Resets and states of environments on `physx_cpu_batch`: arguments in any form, and controllers row by row."""
 
+import difflib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Int
 from mani_skill.utils import common
 from torch import Tensor
 
 from dora.arguments import as_tensor, checked_rows, checked_seeds, is_mask, tensors
-from dora.errors import InputError, suggestion
+from dora.errors import InputError, shown, suggestion
 
 START, STATES = "reset_to_env_states", "env_states"
 """Option of `reset` with states in which episodes begin, and its entry for them."""
+OPTIONS, LIKE = ("env_idx", "reconfigure", START), 0.8
+"""Options of `reset` that every task has, and how like one of them another name is that is taken for a slip [1]."""
 KINDS = ("actors", "articulations")
 """Parts of a state that ManiSkill restores."""
 QUATERNION, UNIT = slice(3, 7), 0.01
@@ -40,22 +44,47 @@ def checked_options(options: Any, count: int, device: torch.device) -> dict[str,
         return {}
     if not isinstance(options, Mapping):
         raise InputError(f"the options of reset must be a dictionary, not {options!r}.")
-    out = {name: value for name, value in options.items() if not (name in ("env_idx", START) and value is None)}
+    for name in options:
+        near = difflib.get_close_matches(str(name), OPTIONS, 1, LIKE)
+        if near and name not in OPTIONS:
+            raise InputError(f"reset has no option {name!r}: did you mean {near[0]!r}?")
+    out = {name: value for name, value in options.items() if not (name in OPTIONS and value is None)}
+    if not isinstance(again := out.get("reconfigure", False), bool | np.bool_):
+        raise InputError(f"options['reconfigure'] must be True or False, not {shown(again)}.")
     mask = order = None
     if "env_idx" in out:
         rows = checked_rows(out["env_idx"], count, device)
         mask = rows if is_mask(out["env_idx"]) else None
         out["env_idx"], order = rows.sort()
+        if again and len(rows) < count:
+            raise InputError("options has both reconfigure and some of the environments: a scene is built for all.")
     if START in out:
         start = out[START]
-        if not isinstance(start, Mapping) or STATES not in start:
+        if not isinstance(start, Mapping) or start.get(STATES) is None:
             raise InputError(f"options[{START!r}] must be a dictionary with {STATES!r} and perhaps 'obs'.")
         given = {name: tensors(value, name, device) for name, value in start.items() if value is not None}
         out[START] = {name: _in_order(_of_mask(value, mask, count), order) for name, value in given.items()}
         states = out[START][STATES]
-        for kind in KINDS if isinstance(states, dict) else ():
-            check_finite_state(states.get(kind, {}), f"{STATES}[{kind!r}]")
+        if isinstance(states, dict):
+            check_parts(states, STATES)
+            for kind in KINDS:
+                check_finite_state(states.get(kind, {}), f"{STATES}[{kind!r}]")
     return out
+
+
+def check_parts(state: Mapping[str, Any], what: str) -> None:
+    """Refuse a state that has no part that ManiSkill restores, or one that is no dictionary.
+
+    Raises:
+        InputError: naming the part.
+    """
+    near = [name for name in state if name not in KINDS and difflib.get_close_matches(str(name), KINDS, 1, LIKE)]
+    if near or not any(kind in state for kind in KINDS):
+        has = f"has {', '.join(map(shown, near or state))}" if state else "is empty"
+        raise InputError(f"{what} {has}: its parts are those of get_state_dict, {' and '.join(KINDS)}.")
+    for name in (*KINDS, "controller"):
+        if not isinstance(state.get(name, {}), Mapping):
+            raise InputError(f"{what}[{name!r}] must be a dictionary, not {shown(state[name])}.")
 
 
 def _in_order(state: Any, order: Tensor | None) -> Any:
@@ -92,8 +121,32 @@ def reset(original: Callable, env: Any, seed: Any = None, options: Any = None) -
         env._last_obs = common.torch_clone_dict(env._last_obs)
     states = start.get(STATES)
     targets = states.get("controller", {}) if isinstance(states, dict) else {}
+    if "obs" in start:
+        _check_like(start["obs"], env._last_obs, env.num_envs if rows is None else len(rows), f"{START}['obs']")
+    if targets:
+        _check_known(targets, env.agent.controller, f"{STATES}['controller']")
     with _controllers_of(env, rows, targets):
         return original(env, seed=seeds, options=options)
+
+
+def _check_like(given: Any, last: Any, count: int, what: str) -> None:
+    """Refuse an observation of `count` environments whose parts or sizes are not those of the last one."""
+    if isinstance(last, Mapping) or isinstance(given, Mapping):
+        if not (isinstance(last, Mapping) and isinstance(given, Mapping) and last.keys() == given.keys()):
+            raise InputError(f"{what} must be an observation of this environment, with all of its parts.")
+        for name, part in last.items():
+            _check_like(given[name], part, count, f"{what}[{name!r}]")
+    elif given.shape != (needed := (count, *last.shape[1:])):
+        raise InputError(f"{what} has shape {tuple(given.shape)} but {tuple(needed)} is needed.")
+
+
+def _check_known(targets: Mapping[str, Any], controller: Any, what: str) -> None:
+    """Refuse a state of controllers that names one that there is not."""
+    several = isinstance(controller, dict)
+    known = {uid: each.get_state() for uid, each in controller.items()} if several else controller.get_state()
+    unknown = [name for name in targets if name not in known]
+    if unknown:
+        raise InputError(f"{what} has {shown(unknown[0])}, which the robot has not: {suggestion(unknown[0], known)}")
 
 
 @contextmanager
@@ -150,6 +203,7 @@ def set_state_dict(original: Callable, env: Any, state: Any, env_idx: Any = None
     rows = None if env_idx is None else checked_rows(env_idx, env.num_envs, env.device)
     if not isinstance(state, Mapping):
         raise InputError(f"the state must be a dictionary as of get_state_dict, not {type(state).__name__}.")
+    check_parts(state, "the state")
     state = tensors(state, "state", env.device)
     count = env.num_envs if rows is None else len(rows)
     rows, order = (None, slice(None)) if rows is None else rows.sort()
