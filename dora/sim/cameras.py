@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from math import isfinite, pi
-from typing import Any
+from typing import Any, TypeGuard
 
+import numpy as np
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES, ObservationModeStruct
+from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Link
@@ -19,6 +21,8 @@ MOST_PIXELS = 4096
 """Largest width and height of a picture [pixels]."""
 FIELDS = tuple(field.name for field in fields(CameraConfig))
 """What `sensor_configs` may set of a camera."""
+KNOWN, FARTHEST = (*FIELDS, "use_stereo_depth"), 1e6
+"""The same and ManiSkill's own word beside them; largest depth that is drawn [m]."""
 DRAWN = ("rgb", "depth", "segmentation", "position")
 """Textures that ManiSkill's fastest shader, "minimal", draws; "default" draws the others as well."""
 SHOWN = ("rgb", "depth", "segmentation", "position")
@@ -89,19 +93,39 @@ def camera_configs(
 # ---- checks --------------------------------------------------------------------------------------
 
 
-def check_settings(configs: Mapping[str, Any]) -> None:
-    """Refuses sizes and angles of `sensor_configs` that cannot be drawn.
+def check_settings(configs: Mapping[str, Any], what: str = "sensor_configs") -> None:
+    """Refuses settings of cameras that cannot be drawn, such as `sensor_configs`, with or without a driver.
+
+    Args:
+        configs: settings of all cameras, and dictionaries of settings by the names of cameras.
+        what: their name, for the message.
 
     Raises:
         InputError: naming the first of them.
     """
     for name, value in configs.items():
         if isinstance(value, Mapping):
-            check_settings(value)
-        elif name in ("width", "height") and not (isinstance(value, int) and 1 <= value <= MOST_PIXELS):
+            check_settings(value, f"{what}[{name!r}]")
+        elif name in ("width", "height") and not (_is_number(value, whole=True) and 1 <= int(value) <= MOST_PIXELS):
             raise InputError(f"the {name} of a camera is {shown(value)}: it must be from 1 to {MOST_PIXELS} pixels.")
-        elif name == "fov" and value is not None and not (isfinite(value) and 0 < value < pi):
+        elif name == "fov" and value is not None and not (_is_number(value) and 0 < value < pi):
             raise InputError(f"the fov of a camera is {shown(value)}: it must lie between 0 and pi [rad].")
+        elif name in ("near", "far") and not (_is_number(value) and 0 < value <= FARTHEST):
+            raise InputError(f"{name} of a camera is {shown(value)}: it must be above 0 and at most {FARTHEST:g} [m].")
+        elif name == "shader_pack" and value not in PREBUILT_SHADER_CONFIGS:
+            raise InputError(f"there is no shader_pack {shown(value)}: {suggestion(value, PREBUILT_SHADER_CONFIGS)}")
+        elif name not in KNOWN:
+            more = "; settings of one camera are a dictionary, by its name."
+            raise InputError(f"{what} has no {name!r}: {suggestion(name, KNOWN).rstrip('.')}{more}")
+    near, far = float(configs.get("near", 0.0)), float(configs.get("far", FARTHEST))
+    if not near < far:
+        raise InputError(f"near is {near} m and far {far} m: a camera draws what lies between them.")
+
+
+def _is_number(value: Any, whole: bool = False) -> TypeGuard[float]:
+    """Whether a value is a finite number, of Python or NumPy."""
+    kinds = (int, np.integer) if whole else (int, float, np.integer, np.floating)
+    return isinstance(value, kinds) and not isinstance(value, bool) and isfinite(value)
 
 
 def check_names(configs: Mapping[str, Any], cameras: Mapping[str, Any]) -> None:
@@ -110,14 +134,13 @@ def check_names(configs: Mapping[str, Any], cameras: Mapping[str, Any]) -> None:
     Raises:
         InputError: naming the first of them, with the nearest known name.
     """
-    known = (*FIELDS, "use_stereo_depth")
     for name, value in configs.items():
         if name in cameras:
-            wrong = next((own for own in value if own not in known), None)
+            wrong = next((own for own in value if own not in KNOWN), None)
             if wrong is not None:
-                raise InputError(f"sensor_configs[{name!r}] has no {wrong!r}: {suggestion(wrong, known)}")
-        elif name not in known:
-            raise InputError(f"there is no camera {name!r}: {suggestion(name, (*cameras, *known))}")
+                raise InputError(f"sensor_configs[{name!r}] has no {wrong!r}: {suggestion(wrong, KNOWN)}")
+        elif name not in KNOWN:
+            raise InputError(f"there is no camera {name!r}: {suggestion(name, (*cameras, *KNOWN))}")
 
 
 def check_cameras(env: Any) -> None:

@@ -23,6 +23,7 @@ from mani_skill.utils.structs.types import SimConfig
 
 from dora.errors import InputError, shown, suggestion
 from dora.sim.batch.hooks import BACKEND, batched_by_default
+from dora.sim.cameras import check_settings
 
 SIM_BACKENDS = ("auto", BACKEND, *backends.sim_backend_name_mapping)
 """Values of `sim_backend`; those of CUDA may have the number of a device, as in "physx_cuda:1"."""
@@ -140,6 +141,7 @@ def checked_values(cls: type, kwargs: Mapping[str, Any]) -> dict[str, Any]:
     for name in SETTINGS:
         if not isinstance(out.get(name, {}), Mapping):
             raise InputError(f"{name} must be a dictionary, not {shown(out[name])}.")
+        check_settings(out.get(name, {}), name)
     if (frequency := out.get("reconfiguration_freq")) is not None and frequency < 0:
         raise InputError(f"reconfiguration_freq is {frequency}: it must be 0 (never) or a number of resets.")
     if _is_ours(cls) and out.get("parallel_in_single_scene"):
@@ -237,6 +239,9 @@ NOT_NEGATIVE = ("spacing", "contact_offset", "sleep_threshold", "bounce_threshol
 """Numbers of a sim_config that must not be negative."""
 LARGEST_GRAVITY = 1e4
 """[m/s^2]."""
+LARGEST, LARGEST_COUNT = {"_freq": 100_000, "_iterations": 255}, 2**31 - 1
+"""Largest rates [Hz] and PhysX's largest numbers of iterations, by the ends of their names, and that of any other whole
+number."""
 
 
 # ---- sim_config ----------------------------------------------------------------------------------
@@ -268,6 +273,8 @@ def _checked_setting(path: str, value: Any, hint: Any) -> Any:
     if hint is int:
         if (whole := _typed(path, value, int)) < (1 if name.endswith("_freq") else 0):
             raise InputError(f"{path} is {value}: it is too small.")
+        if whole > next((most for ending, most in LARGEST.items() if name.endswith(ending)), LARGEST_COUNT):
+            raise InputError(f"{path} is {shown(value)}: it is too large.")
         return whole
     if hint is float:
         if not (isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)):

@@ -56,7 +56,7 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Any, sim_config: An
     """
     randomisation = find_preset(preset, cls.PRESETS)
     base: TaskConfig = replace(cls(), randomisation=randomisation, **cls.BY_PRESET.get(preset, {}))
-    config = _with_rates(overridden(base, changes or {}, "config"), sim_config)
+    config = _with_rates(overridden(base, {} if changes is None else changes, "config"), sim_config)
     check_finite(config, "config")
     check_not_negative(config, "config")
     check_not_negative(config.residual, "config.residual")

@@ -8,7 +8,7 @@ affordance  candidates that hold the target region, and that region in observati
 from collections.abc import Collection
 from typing import Any
 
-from dora.errors import InputError
+from dora.errors import InputError, shown
 
 GUIDANCE = ("affordance", "grasps", "none")
 """Values of the switch `guidance`."""
@@ -35,8 +35,8 @@ def guidance_in_force(guidance: str, parts: Any) -> frozenset[str]:
     if not (parts is None or isinstance(parts, str | Collection)):
         raise InputError(f"guidance_parts must be a list of {', '.join(PARTS)}, not {parts!r}")
     named = PARTS if parts is None else (parts,) if isinstance(parts, str) else tuple(parts)
-    if unknown := set(named) - set(PARTS):
-        raise InputError(f"unknown guidance part {sorted(unknown)[0]!r}; choose among {', '.join(PARTS)}")
+    if unknown := [part for part in named if part not in PARTS]:
+        raise InputError(f"unknown guidance part {shown(unknown[0])}; choose among {', '.join(PARTS)}")
     return frozenset(named) | ({REGION} if guidance == "affordance" else frozenset())
 
 
