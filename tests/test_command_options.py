@@ -171,6 +171,7 @@ def test_searches(words: str, message: str, monkeypatch: pytest.MonkeyPatch, cap
         ("bench", "physics --starts 0", "--starts is 0"),
         ("bench", f"physics --starts {HUGE}", "--starts"),
         ("bench", "physics --settings 240:nan:8", "contact offset"),
+        ("bench", "physics --settings", "at least one FREQUENCY"),
         ("bench", "physics --settings 240:10:1000", "number of iterations 1000"),
         ("bench", f"physics --settings {HUGE}:10:8", "rate in Hz"),
         ("bench", "physics --settings 240:10", "is not FREQUENCY"),

@@ -19,6 +19,7 @@ from dora.agents.evaluation.evaluate import Evaluation, run_batch
 from dora.agents.reports.report import write_report
 from dora.agents.reports.run_results import find_runs
 from dora.agents.reports.starts import bins, starts_section
+from dora.errors import InputError
 
 
 @pytest.fixture(scope="module", params=["DoraJug-v1", "DoraMicrowave-v1"])
@@ -139,3 +140,31 @@ def test_a_report_shows_success_against_the_start(tmp_path: Path):
     assert "Success against how episodes began" in (tmp_path / "out" / "comparison.md").read_text()
     picture = next(path for path in paths if path.name == "Toy-v1-starts.png")
     assert imageio.imread(picture).std() > 1
+
+
+def test_names_of_numbers_are_drawn_as_they_are_and_not_too_many(tmp_path: Path):
+    """A name that matplotlib would take for a formula; a hundred numbers are in the table, thirty in the picture."""
+    count, names = 40, ["$x^{$", *(f"n{k}" for k in range(99))]
+    write_run(tmp_path / "runs" / "0", 0, 0.5, episodes=count)
+    values = np.random.default_rng(0).random((count, len(names)))
+    lines = [",".join(map(str, [i, i % 2, *row])) for i, row in enumerate(values)]
+    header = ",".join(["episode", "success", *(f"start/{name}" for name in names)])
+    (tmp_path / "runs" / "0" / "eval.csv").write_text("\n".join([header, *lines]) + "\n")
+    assert len(starts_section(find_runs(tmp_path / "runs")).rows) == 100
+    picture = next(p for p in write_report(tmp_path / "runs", tmp_path / "out") if p.name == "Toy-v1-starts.png")
+    assert imageio.imread(picture).shape[0] < 5000
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("episode,success,penetration_mm\n", "has no episode"),
+        (f"episode,success,{'x' * 201}\n0,1,2\n", "more than 200"),
+    ],
+)
+def test_an_empty_table_of_episodes_and_endless_names_are_refused(content: str, words: str, tmp_path: Path):
+    write_run(tmp_path / "runs" / "0", 0, 0.5)
+    (tmp_path / "runs" / "0" / "eval.csv").write_text(content)
+    with pytest.raises(InputError, match=words):
+        write_report(tmp_path / "runs", tmp_path / "out")
+    assert not (tmp_path / "out").exists()

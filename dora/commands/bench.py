@@ -96,6 +96,8 @@ def bench_physics(
         preset: how much they are randomised.
         json: print one JSON object on the last line instead of a table.
     """
+    if not settings:
+        raise InputError(f"--settings needs at least one FREQUENCY:OFFSET:ITERATIONS, such as {PHYSICS[0]}.")
     asked = [task_physics.parse_physics(text) for text in settings]
     with ProgressDisplay() as progress:
         update = progress.phase(f"physics of {env}", "settings")

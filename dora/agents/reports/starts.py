@@ -17,8 +17,8 @@ PREFIX = "start/"
 """Of the columns of an eval.csv that say how its episode began."""
 PARTS = 4
 """Parts with equally many episodes into which those of a group are divided [1]."""
-ACROSS = 3
-"""Pictures in a row of the figure [1]."""
+ACROSS, MOST_DRAWN = 3, 30
+"""Pictures in a row of the figure, and in all of it; further numbers stand in the table alone [1]."""
 
 Episodes = Mapping[str, Float[np.ndarray, " _"]]
 """Columns of an eval.csv, or of those of several seeds, one after the other."""
@@ -86,6 +86,7 @@ def draw_starts(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
         for tables, style in (([m.episodes for m in members], "-"), (zero_episodes(members), ":"))
     ]
     names = list(dict.fromkeys(n for episodes, *_ in lines for n in filter(_is_start, episodes) if bins(episodes, n)))
+    names = names[:MOST_DRAWN]
     down = -(-max(len(names), 1) // ACROSS)
     figure, axes = pyplot.subplots(
         down, ACROSS, figsize=(13, 0.8 + 3.2 * down), layout="constrained", squeeze=False, sharey=True
@@ -103,7 +104,7 @@ def draw_starts(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
                     middle, share, (share - ends[:, 0], ends[:, 1] - share), linestyle=style, marker="o", markersize=3,
                     capsize=2, color=COLOURS.get(group[2:4]), label=label,
                 )  # fmt: skip
-        axis.set_xlabel(name.removeprefix(PREFIX).replace("_", " "))
+        axis.set_xlabel(shortened(name.removeprefix(PREFIX).replace("_", " ")), parse_math=False)
         axis.set_ylim(-0.02, 1.02)
         axis.grid(alpha=0.3)
     for axis in axes.flat[len(names) :]:

@@ -127,6 +127,8 @@ def read_episodes(path: Path) -> dict[str, list[float]]:
         InputError: it is too large, no table, lacks a column, or has a cell that is no number or a success but 0 or 1.
     """
     columns = _read_table(path, EPISODE_COLUMNS, MOST_EPISODES, all_columns=True)
+    if not columns["success"]:
+        raise _damaged(path, "it has no episode")
     if not all(value in (0.0, 1.0) for value in columns["success"]):
         raise _damaged(path, "success is not 0 or 1 everywhere")
     return columns
@@ -168,6 +170,8 @@ def _read_table(path: Path, needed: tuple[str, ...], most: int, all_columns: boo
         header = next(lines, [])
         if len(header) > MOST_COLUMNS or len(set(header)) < len(header) or not set(needed) <= set(header):
             raise ValueError("it lacks a column, or has one twice")
+        if any(len(name) > LONGEST_NAME for name in header):
+            raise ValueError(f"a column has a name of more than {LONGEST_NAME} characters")
         names = tuple(header) if all_columns else needed
         at, columns = [header.index(name) for name in names], {name: list[float]() for name in names}
         for count, line in enumerate(lines, 1):
