@@ -22,7 +22,7 @@ DEEP = 0.06
 SCRAP = 0.05
 """Share of the area up to which a component that cannot be closed, or is flat, is dropped [1]."""
 MOST_SCRAPS = 0.2
-"""Share of the area above which scraps together are no scraps any more [1]."""
+"""Share of the area above which all that is dropped, loose bodies included, are no scraps any more [1]."""
 MOST_BODIES = 1000
 """Largest number of connected parts; each takes a few milliseconds [1]."""
 LEAST_VOLUME = 1e-4
@@ -104,6 +104,7 @@ def repair(mesh: trimesh.Trimesh, labels: Int[np.ndarray, " f"], name: str) -> R
     outer = [bodies[i] for i in found.outer]
     kept, loose, clusters = loose_parts([body.mesh for body in outer])
     scraps += [outer[i].mesh.area for i in loose]
+    _check_dropped([outer[i].mesh for i in kept], scraps, mesh.area, name)
     outer, cavities = [outer[i] for i in kept], [found.cavities[i] for i in kept]
     filled = [bodies[i].mesh.area for i in found.filled if bodies[i].mesh.area > INSIDE * mesh.area]
     actions = _actions(outer, found, dropped, scraps, mesh.area, clusters, len(filled))
@@ -142,12 +143,18 @@ def _bodies(mesh: trimesh.Trimesh, labels: np.ndarray, name: str) -> tuple[list[
                 bodies.append(body)
     if not bodies:
         raise InputError(f"{name} is a cloud of loose faces: export one closed surface per body.")
-    if sum(scraps) > MOST_SCRAPS * mesh.area:
-        raise InputError(
-            f"{name} falls into {len(bodies)} bodies and {len(scraps)} loose scraps, which are "
-            f"{sum(scraps) / mesh.area:.0%} of its surface: join them in a mesh editor, for instance by remeshing."
-        )
+    _check_dropped([body.mesh for body in bodies], scraps, mesh.area, name)
     return bodies, scraps
+
+
+def _check_dropped(kept: list[trimesh.Trimesh], scraps: list[float], area: float, name: str) -> None:
+    """Refuses to drop more than `MOST_SCRAPS` of an area, or of what would be left of it without bodies in others."""
+    share = sum(scraps) / min(area, sum(scraps) + sum(float(mesh.area) for mesh in kept))
+    if share > MOST_SCRAPS:
+        raise InputError(
+            f"{name} falls into {len(kept)} bodies and {len(scraps)} loose scraps, which are {share:.0%} of its "
+            "surface: join them in a mesh editor, for instance by remeshing."
+        )
 
 
 def _actions(
