@@ -20,6 +20,19 @@ MESH: dict[str, Any] = {
                   {"count": 300_000, "componentType": 5125, "type": "SCALAR"}],
 }  # fmt: skip
 """A glTF file of 100,000 triangles without any data."""
+MESH_OF_60 = [{"primitives": [{"attributes": {"POSITION": 0}}] * 60}]
+"""A mesh of many parts, each of a hundred triangles."""
+FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+"""A triangle of an STL in text."""
+CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+"""Vertices of a triangle of an OBJ."""
+MODEL = '<model xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">'
+"""Beginning of the model of a 3MF file."""
+TRIANGLE = (
+    '<mesh><vertices><vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/></vertices>'
+    '<triangles><triangle v1="0" v2="1" v3="2"/></triangles></mesh>'
+)
+"""A mesh of a 3MF file."""
 
 
 def glb(header: dict[str, Any] | bytes) -> bytes:
@@ -40,11 +53,13 @@ def test_huge_meshes_are_refused_by_their_size(tmp_path: Path, name: str):
     ("header", "words"),
     [
         (MESH | {"accessors": [{"count": 10**10, "componentType": 5126, "type": "VEC3"}]}, "declares"),
-        (MESH | {"nodes": [{"children": list(range(1, 5000))}, *[{"mesh": 0}] * 5000]}, "faces; reduce it"),
+        (MESH | {"nodes": [{"children": list(range(1, 3000))}, *[{"mesh": 0}] * 3000]}, "faces; reduce it"),
         (MESH | {"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}, "contains itself"),
         (MESH | {"nodes": [*({"children": [i + 1, i + 1]} for i in range(30)), {"mesh": 0}]}, "repeats its parts"),
         (MESH | {"nodes": [{"children": [1, 1]}, {"mesh": 0}]}, "several parents"),
-        (MESH | {"nodes": [{}] * 10_001}, "more than 10000 nodes"),
+        (MESH | {"nodes": [{}] * 4001}, "more than 4000 nodes"),
+        (MESH | {"nodes": [{"mesh": 0}] * 70, "meshes": MESH_OF_60}, "more than 4000 nodes or parts"),
+        (MESH | {"nodes": [*({"children": [i + 1]} for i in range(101)), {"mesh": 0}]}, "100 levels deep"),
         (b'{"a":' + b"[" * 100_000, "not valid JSON"),
         ([], "no glTF header"),
     ],
@@ -64,11 +79,79 @@ def test_gltf(tmp_path: Path, header: Any, words: str):
         ("a.ply", "ply\ncomment ascii\n" + "0 0 0\n" * 600_000, "600002 lines"),
         ("a.ply", "ply\nFormat ASCII 1.0\n" + "0 0 0\n" * 600_000, "600002 lines"),
         ("a.ply", "ply\nformat binary_little_endian 1.0 ascii\n" + "0 0 0\n" * 600_000, "600002 lines"),
+        ("a.stl", "solid a\n" + "vertex\n" * 600_001 + "endsolid\n", "200000 faces; reduce it"),
+        ("a.stl", "solid \u0416\n" + "VERTEX 0 0 0\n" * 900_000 + "endsolid\n", "300000 faces; reduce it"),
+        ("a.stl", "solid a\n" + "\n" * 1_500_000 + "endsolid\n", "1500002 lines"),
+        ("a.stl", "solid a\nvertex " + "0 " * 100_000 + "\nendsolid\n", "long ones: write it again in binary"),
+        ("a.stl", "solid a\nnormal " + "0 " * 100_000 + "\nendsolid\n", "long ones: write it again in binary"),
+        ("a.stl", "solid \u0416\n" + FACET.replace(" ", " " * 8) * 90_000 + "endsolid\n", "16000000 with such"),
     ],
 )
 def test_meshes_in_text_have_a_limit_of_lines(tmp_path: Path, name: str, content: str, words: str):
     with refused(words):
         read_mesh(written(tmp_path / name, content))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.stl", f"solid a\n{FACET}endsolid a\n" * 1001, "1001 solids, and may have 1000: join"),
+        ("a.stl", f"SOLID a\n{FACET}ENDSOLID a\n" * 1001, "1001 solids, and may have 1000: join"),
+        ("a.obj", CORNERS + "".join(f"usemtl {i}\nf 1 2 3\n" for i in range(1001)), "more than 1000 materials"),
+        ("a.obj", CORNERS + "".join(f"usemtl {i}\r\nf 1 2 3\r\n" for i in range(1001)), "more than 1000 materials"),
+        ("a.obj", CORNERS + "".join(f"use\\\nmtl {i}\nf 1 2 3\n" for i in range(1001)), "more than 1000 materials"),
+        ("a.obj", CORNERS + "".join(f"o {i}\nf 1 2 3\n" for i in range(1001)), "more than 1000 objects"),
+        ("a.obj", CORNERS + "".join(f"g {i}\nf 1 2 3\n" for i in range(1001)), "more than 1000 groups"),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_parts_have_a_limit(tmp_path: Path, name: str, content: str, words: str, encoding: str):
+    with refused(words, 1.0):
+        read_mesh(written(tmp_path / name, content.encode(encoding)))
+
+
+def test_a_few_parts_named_many_times_are_read(tmp_path: Path):
+    rows = "".join(f"usemtl {i % 2}\nf 1 2 3\n" for i in range(3000))
+    mesh, names = read_mesh(written(tmp_path / "a.obj", CORNERS + rows))
+    assert len(mesh.faces) == len(names) == 3000
+
+
+def zipped(path: Path, **models: str) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in models.items():
+            archive.writestr(f"3D/{name}", f"{MODEL}{content}</model>")
+    return path
+
+
+PART = '<component objectid="1" path="/3D/far.model"/>'
+"""A component that names another file."""
+
+
+@pytest.mark.parametrize(
+    ("objects", "items", "words"),
+    [
+        (f'<object id="1">{TRIANGLE}</object>', '<item objectid="1"/>' * 1001, "repeats its parts more than 1000"),
+        ("".join(f'<object id="{i}">{TRIANGLE}</object>' for i in range(1001)), "", "more than 1000 objects"),
+        (f'<object id="1">{TRIANGLE * 2001}</object>', '<item objectid="1"/>', "more than 1000 objects"),
+        (f'<object id="2"><components>{PART * 900}</components></object>', "", "its files too often"),
+        (f'<object id="2">{PART.replace("far.model", "far.png")}</object>', "", "'3D/far.png', which is no model"),
+        (f'<object id="1">{TRIANGLE}</object><object id="2"><components>{PART * 40}</components></object>',
+         '<item objectid="2"/>' * 40, "repeats its parts more than 1000"),
+    ],
+    ids=["items", "objects", "meshes", "files", "no model", "items of components"],
+)  # fmt: skip
+def test_3mf(tmp_path: Path, objects: str, items: str, words: str):
+    far = {"far.model": '<object id="1"/>' + "<a/>" * 1200, "far.png": ""}
+    model = f"<resources>{objects}</resources><build>{items}</build>"
+    with refused(words, 1.0):
+        read_mesh(zipped(tmp_path / "a.3mf", **{"3dmodel.model": model}, **far))
+
+
+def test_a_3mf_of_many_parts_is_read(tmp_path: Path):
+    objects = "".join(f'<object id="{i}">{TRIANGLE}</object>' for i in range(30))
+    items = "".join(f'<item objectid="{i % 30}"/>' for i in range(100))
+    model = f"<resources>{objects}</resources><build>{items}</build>"
+    assert len(read_mesh(zipped(tmp_path / "a.3mf", **{"3dmodel.model": model}))[0].faces) == 100
 
 
 @pytest.mark.parametrize("name", ["/dev/zero", "../../etc/passwd", "/etc/passwd"])

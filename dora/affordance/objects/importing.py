@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,9 +18,9 @@ from dora.affordance.objects.decomposition import THRESHOLD, decompose
 from dora.affordance.objects.labels import WHOLE, FaceLabels, grasp_classes, read_labels, without_number
 from dora.affordance.objects.surface_repair import repair
 from dora.affordance.objects.surfaces.weighing import Weighing, check_weight, weigh
-from dora.containers import MOST_BYTES, MOST_FACES, check_container
+from dora.containers import MOST_BYTES, MOST_FACES, check_container, check_groups, without_mark
 from dora.errors import InputError, shown
-from dora.reading import decoded, read_bytes
+from dora.reading import read_bytes
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Factor from each unit of length to metres [m]."""
@@ -179,6 +178,7 @@ def read_mesh(path: Path, keep_order: bool = False) -> tuple[trimesh.Trimesh, li
 
 def _obj_parts(path: Path) -> list[tuple[str, trimesh.Trimesh]]:
     """Triangle meshes of an OBJ file, named by objects if there are several, else by groups, else by materials."""
+    check_groups(path)
     for split in ({"split_objects": True, "group_material": False}, {"split_groups": True, "group_material": False}):
         parts = _load(path, split)
         if len({name for name, _ in parts}) > 1:
@@ -194,19 +194,13 @@ class _Neighbours(FilePathResolver):
         path = (folder / name.strip()).resolve()
         if not path.is_relative_to(folder):
             raise InputError(f"it names the file {shown(name)}, which does not lie beside it")
-        return _without_mark(read_bytes(path, "file that a mesh names", MOST_BYTES))
-
-
-def _without_mark(content: bytes) -> bytes:
-    """The content of a file; a text with a byte order mark in UTF-8 without one."""
-    marked = content.startswith((codecs.BOM_UTF8, codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    return decoded(content).encode() if marked else content
+        return without_mark(read_bytes(path, "file that a mesh names", MOST_BYTES))
 
 
 def _load(path: Path, options: dict[str, Any]) -> list[tuple[str, trimesh.Trimesh]]:
     """The parts of the scene that trimesh reads from a file; `options` are those of its format."""
     try:
-        content = io.BytesIO(_without_mark(read_bytes(path, "mesh file", MOST_BYTES)))
+        content = io.BytesIO(without_mark(read_bytes(path, "mesh file", MOST_BYTES)))
         kind, files = path.suffix.lower().removeprefix("."), _Neighbours(str(path))
         return _parts(trimesh.load_scene(content, file_type=kind, resolver=files, process=False, **options), path)
     except TooLarge:
