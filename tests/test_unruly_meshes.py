@@ -114,31 +114,6 @@ def test_a_surface_of_many_scraps_is_refused():
         mended(cylinder(), *scraps)
 
 
-def beads(count: int, edge: float = 0.01, copies: int = 1) -> list[trimesh.Trimesh]:
-    """Cubes apart from each other in rows of ten, each with smaller ones inside."""
-    own = trimesh.creation.box((edge,) * 3)
-    places = [(0.1 + 0.05 * (i % 10), 0.05 * (i // 10)) for i in range(count)]
-    return [at(scaled(own, 0.97**k), x, y, 0) for x, y in places for k in range(copies)]
-
-
-@pytest.mark.parametrize(
-    ("meshes", "words"),
-    [
-        (beads(110), "falls into 0 bodies and 110 loose scraps, which are 100% of its surface: join them"),
-        (beads(101, copies=2), "falls into 0 bodies and 101 loose scraps, which are 100% of its surface"),
-        ([cube(), *beads(99, 0.006)], "falls into 1 bodies and 99 loose scraps, which are 59% of its surface"),
-        (
-            [cube(), *beads(25, 0.005), at(scrap(0.025), 0, 0.1, 0)],
-            "falls into 1 bodies and 26 loose scraps, which are 23%",
-        ),
-    ],
-    ids=["equal", "equal with bodies inside", "beside a large one", "and an open one"],
-)
-def test_bodies_that_touch_nothing_are_not_dropped_if_they_are_most(meshes: list[trimesh.Trimesh], words: str):
-    with pytest.raises(InputError, match=words):
-        mended(*meshes)
-
-
 def test_small_parts_that_touch_and_large_ones_that_do_not_stay():
     button = at(trimesh.creation.box((0.006,) * 3), RADIUS, 0, 0)
     assert mended(cylinder(), button).actions == ("united 2 bodies",)

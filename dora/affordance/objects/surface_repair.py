@@ -9,9 +9,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Int
 
-from dora.affordance.objects.signed_distance import ExactDistance
 from dora.affordance.objects.solids import unite
-from dora.affordance.objects.surfaces.body_relations import Nesting, loose_parts, nesting
+from dora.affordance.objects.surfaces.body_relations import Nesting, inside_others, loose_parts, meetings, nesting
 from dora.affordance.objects.surfaces.face_cleaning import adjacency, clean
 from dora.errors import InputError
 
@@ -25,6 +24,8 @@ MOST_SCRAPS = 0.2
 """Share of the area above which all that is dropped, loose bodies included, are no scraps any more [1]."""
 MOST_BODIES = 1000
 """Largest number of connected parts; each takes a few milliseconds [1]."""
+MOST_MEETINGS = 20_000
+"""Largest number of pairs of bodies whose bounding boxes overlap; uniting takes up to 0.3 ms for each [1]."""
 LEAST_VOLUME = 1e-4
 """Smallest ratio of volume to area^1.5 [1]; a ball has 0.094, a sheet 0."""
 FLAT = 0.015
@@ -99,9 +100,14 @@ def repair(mesh: trimesh.Trimesh, labels: Int[np.ndarray, " f"], name: str) -> R
     """
     mesh, labels, dropped = clean(mesh, labels)
     bodies, scraps = _bodies(mesh, labels, name)
-    bodies = [_without_buried_openings(body, bodies) for body in bodies]
+    bodies = _without_buried_openings(bodies)
     found = nesting([(body.mesh, body.sense) for body in bodies])
     outer = [bodies[i] for i in found.outer]
+    if (pairs := meetings([body.mesh for body in outer])) > MOST_MEETINGS:
+        raise InputError(
+            f"{name} has {len(outer)} bodies, {pairs} pairs of which overlap or may do so, and may have "
+            f"{MOST_MEETINGS}: unite them in a mesh editor."
+        )
     kept, loose, clusters = loose_parts([body.mesh for body in outer])
     scraps += [outer[i].mesh.area for i in loose]
     _check_dropped([outer[i].mesh for i in kept], scraps, mesh.area, name)
@@ -208,17 +214,18 @@ def _closed(part: trimesh.Trimesh, labels: np.ndarray, total_area: float, name: 
     return Body(body, labels, fills.count - wide, wide, added, sheet, turned, sense)
 
 
-def _without_buried_openings(body: Body, bodies: list[Body]) -> Body:
-    """The body, taken for solid if all its openings end inside other bodies, as those of a tube used as a handle."""
-    count = body.holes + body.mouths
-    if body.sheet is None or len(bodies) == 1:
-        return body
-    middles = np.array(body.mesh.vertices)[-count:]
-    buried = np.zeros(count, bool)
-    for other in (each.mesh for each in bodies if each is not body):
-        near = ((middles > other.bounds[0]) & (middles < other.bounds[1])).all(1)
-        buried[near] |= ExactDistance(other)(middles[near]) < 0
-    return replace(body, sheet=None, holes=count, mouths=0) if buried.all() else body
+def _without_buried_openings(bodies: list[Body]) -> list[Body]:
+    """Bodies; those whose openings all end inside others, as those of a tube used as a handle, are taken for solid."""
+    sheets = {i: body.holes + body.mouths for i, body in enumerate(bodies) if body.sheet is not None}
+    if len(bodies) == 1 or not sheets:
+        return bodies
+    middles = np.concatenate([np.array(bodies[i].mesh.vertices)[-count:] for i, count in sheets.items()])
+    owner = np.repeat(list(sheets), list(sheets.values()))
+    seen = owner[~inside_others(middles, owner, [body.mesh for body in bodies])]
+    buried = sheets.keys() - set(seen.tolist())
+    return [
+        replace(body, sheet=None, holes=sheets[i], mouths=0) if i in buried else body for i, body in enumerate(bodies)
+    ]
 
 
 @dataclass(frozen=True)
