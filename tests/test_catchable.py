@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand.postures import flexion
+from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.robot import load_robot
 from dora.tasks.hammer.reach import REACH, TURN, with_waiting_hand, within_reach
@@ -67,3 +69,8 @@ def test_only_grasps_that_face_the_waiting_hand_can_be_used():
     )
     assert usable(best).tolist() == [True]
     assert usable(behind).tolist() == [False]
+
+
+def test_a_posture_that_the_robot_does_not_have_is_refused():
+    with pytest.raises(InputError, match="'diana7_hit' has no posture 'nowhere'; choose from zero, home"):
+        with_waiting_hand(load_candidates("cube").select([0, 1]), load_robot("diana7_hit"), "nowhere")

@@ -47,6 +47,28 @@ def cut(name: str, size: int) -> Callable[[Path], object]:
     return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:size])
 
 
+def many_hulls(folder: Path) -> None:
+    """Damage: all pieces that there may be, each of many faces."""
+    directions = np.random.default_rng(0).normal(size=(251, 3))
+    ball = trimesh.convex.convex_hull(0.03 * directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    write_ply(folder / "hull-1.ply", ball)
+    piece = '\n[[pieces]]\nregion = "side"\nmesh = "hull-1.ply"\n'
+    text = (folder / "object.toml").read_text()
+    (folder / "object.toml").write_text(text[: text.index("[[pieces]]")] + piece * 500)
+
+
+def inertia(moment: float) -> Callable[[Path], object]:
+    """Damage: another inertia, of three equal moments."""
+
+    def damage(folder: Path) -> None:
+        text = (folder / "object.toml").read_text()
+        start, end = text.index("inertia"), text.index("friction")
+        rows = f"[[{moment}, 0, 0], [0, {moment}, 0], [0, 0, {moment}]]"
+        (folder / "object.toml").write_text(f"{text[:start]}inertia = {rows}\n{text[end:]}")
+
+    return damage
+
+
 BOX = two_regions().mesh
 OPEN = trimesh.Trimesh(BOX.vertices, BOX.faces[1:], process=False)
 INSIDE_OUT = trimesh.Trimesh(BOX.vertices, BOX.faces[:, ::-1], process=False)
@@ -75,6 +97,20 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str, str]] = {
     "mass huge": (edited("mass = 0.2", "mass = 1" + "0" * 400), "object.toml", "mass must be finite"),
     "mass zero": (edited("mass = 0.2", "mass = 0"), "object.toml", "mass is 0.0; it must be positive"),
     "friction": (edited("friction = 0.7", "friction = -1"), "object.toml", "friction is -1.0; it must be positive"),
+    "friction large": (edited("friction = 0.7", "friction = 1e8"), "object.toml", "friction is 1e.08; it must be 0 to"),
+    "mass large": (edited("mass = 0.2", "mass = 1e8"), "object.toml", "mass is 1e.08; it must be 1e-05 to 100"),
+    "mass small": (edited("mass = 0.2", "mass = 1e-8"), "object.toml", "mass is 1e-08; it must be 1e-05 to 100"),
+    "inertia large": (inertia(1e8), "object.toml",
+                      "inertia has the moment 1e.08, and a body of this mass and size has"),
+    "inertia small": (inertia(1e-12), "object.toml",
+                      "inertia has the moment 1e-12, and a body of this mass and size has"),
+    "class twice": (edited('"SideGrasp"', '"BodyGrasp"'), "object.toml", "two regions have the grasp_class 'Body"),
+    "piece far away": (edited("position = [0.0,", "position = [1e8,"), "object.toml", "piece 0 reaches farther than 2"),
+    "piece large": (edited("size = [0.025,", "size = [1e8,"), "object.toml", "piece 0 reaches farther than 2.0 m"),
+    "hull of many vertices": (swapped(trimesh.creation.icosphere(3, 0.03), None, "hull-1.ply"), "hull-1.ply",
+                              "has 642 vertices; a hull may have at most 255"),
+    "hull of many bytes": (lambda f: (f / "hull-1.ply").write_bytes(bytes(1_000_001)), "hull-1.ply", "at most 1000000"),
+    "hulls of many faces": (many_hulls, "object.toml", "pieces have 249000 faces; reduce them to at most 200000"),
     "placement": (edited('"table"', '"shelf"'), "object.toml", "placement is 'shelf'; choose one of: table, air, fix"),
     "placement type": (edited('placement = "table"', "placement = []"), "object.toml", r"placement is \[\]"),
     "posture": (edited('"home"', '""'), "object.toml", "start_posture must be a text"),

@@ -127,6 +127,16 @@ class RobotDescription:
     contacts: dict[str, Contact]
     ignored_pairs: frozenset[tuple[str, str]]
 
+    def posture(self, name: str) -> Posture:
+        """A posture by its name.
+
+        Raises:
+            InputError: the robot has none of that name.
+        """
+        if name not in self.postures:
+            raise InputError(f"{self.name!r} has no posture {name!r}; choose from {', '.join(self.postures)}.")
+        return self.postures[name]
+
     @cached_property
     def hand_actuated(self) -> np.ndarray:
         """Indices (n_actuated,) of the hand joints with a drive of their own, ascending."""

@@ -196,8 +196,8 @@ class DescribedRobot(BaseAgent):
         return compose(self.base_pose(), self.posture_wrist(name))
 
     def posture_wrist(self, name: str) -> tuple[Tensor, Tensor]:
-        """Wrist pose (1, 3) [m], (1, 4) wxyz in the robot's base frame, in a named posture."""
-        arm = torch.tensor(self.description.postures[name].arm, dtype=torch.float32, device=self.device)
+        """Wrist pose (1, 3) [m], (1, 4) wxyz in the base frame, in a posture; errors as `RobotDescription.posture`."""
+        arm = torch.tensor(self.description.posture(name).arm, dtype=torch.float32, device=self.device)
         position, matrix = SerialChain.of(self.description, device=self.device).tip_pose(arm[None])
         return position, quaternion_from_matrix(matrix)
 

@@ -24,8 +24,10 @@ from dora.affordance.objects.affordance_object import (
 )
 from dora.affordance.objects.importing import LARGEST, SMALLEST
 from dora.affordance.objects.mesh_files import LABEL, read_ply
+from dora.affordance.objects.surfaces.weighing import MASSES
+from dora.containers import MOST_FACES
 from dora.errors import InputError, shown
-from dora.reading import Table, TomlTables, read_toml
+from dora.reading import Table, TomlTables, check_size, read_toml
 from dora.robot.shapes import Shape
 
 OBJECT_FILE = "object.toml"
@@ -34,6 +36,14 @@ FORMAT = "dora-object 1"
 """Format and version of an object's folder."""
 MOST_PIECES = 1000
 """Largest number of tables in a list [1]."""
+MOST_CORNERS = 255
+"""Largest number of vertices of a convex hull, which is PhysX's [1]."""
+MOST_HULL_BYTES = 1_000_000
+"""Size of the file of a convex hull above which it is not read [bytes]."""
+MOST_FRICTION = 10.0
+"""Largest coefficient of friction; rubber on rubber has 1 to 4 [1]."""
+GYRATION = (1e-4, 10.0)
+"""Range of the largest moment of inertia, as a share of mass times squared reach from the origin; a ring has 1 [1]."""
 FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*\.ply")
 """Names of mesh files: plain, so that they lie in the folder itself."""
 SIZES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}
@@ -72,6 +82,7 @@ class _Reader:
         self.folder, self.path = folder, folder / OBJECT_FILE
         self.check = TomlTables(self.path, KEYS)
         self.fail = self.check.fail
+        self.hulls: dict[str, trimesh.Trimesh] = {}
 
     def content(self) -> Table:
         """The tables of the file, with known keys alone."""
@@ -97,6 +108,8 @@ class _Reader:
         content = self.content()
         names, classes = self.regions(content["regions"])
         mesh, labels = self.surface(content["mesh"], names)
+        mass = self.within(content["mass"], MASSES, "mass")
+        reach = float(np.linalg.norm(mesh.vertices, axis=1).max())
         rest = self.quaternion(content.get("rest", list(UPRIGHT)), "rest")
         return AffordanceObject(
             name=content["name"],
@@ -106,13 +119,13 @@ class _Reader:
             classes=classes,
             target=self.check.one_of(content["target"], names, "target"),
             solid=self.closed(content["solid"])[0] if "solid" in content else mesh,
-            mass=self.check.positive(content["mass"], "mass"),
-            inertia=self.inertia(content["inertia"]),
+            mass=mass,
+            inertia=self.inertia(content["inertia"], mass * reach**2),
             pieces=self.pieces(content["pieces"], names),
             support=support_height(mesh, rest),
             rest=rest,
             digest=surface_digest(mesh, labels, names),
-            friction=self.check.positive(content.get("friction", FRICTION), "friction"),
+            friction=self.within(content.get("friction", FRICTION), (0.0, MOST_FRICTION), "friction"),
             placement=self.check.one_of(content.get("placement", "table"), get_args(Placement), "placement"),
             start_posture=self.check.text(content.get("start_posture", HOME), "start_posture"),
             folder=self.folder,
@@ -130,8 +143,16 @@ class _Reader:
             raise self.fail(f"{where} must be a quaternion (w, x, y, z) of norm 1.")
         return w, x, y, z
 
-    def inertia(self, value: Any) -> Float[np.ndarray, "3 3"]:
-        """An inertia [kg m^2] that a body can have: symmetric, no principal moment above the sum of the others."""
+    def within(self, value: Any, bounds: tuple[float, float], where: str) -> float:
+        """A positive number in a range."""
+        number = self.check.positive(value, where)
+        if not bounds[0] <= number <= bounds[1]:
+            raise self.fail(f"{where} is {number:g}; it must be {bounds[0]:g} to {bounds[1]:g}.")
+        return number
+
+    def inertia(self, value: Any, scale: float) -> Float[np.ndarray, "3 3"]:
+        """An inertia [kg m^2] that a body can have: symmetric, no principal moment above the sum of the others, and
+        not far from `scale`, its mass times its squared reach [kg m^2]."""
         if not isinstance(value, list) or len(value) != 3:
             raise self.fail("inertia must be a list of 3 lists of 3 numbers.")
         found = np.array([self.check.numbers(row, 3, "each row of inertia") for row in value])
@@ -141,6 +162,11 @@ class _Reader:
         least, middle, most = np.linalg.eigvalsh(found)
         if not (least > 0 and least + middle >= most - slack):
             raise self.fail("inertia belongs to no body: check that it is about the centre of mass, in kg m^2.")
+        if not GYRATION[0] * scale <= most <= GYRATION[1] * scale:
+            raise self.fail(
+                f"inertia has the moment {most:g}, and a body of this mass and size has {GYRATION[0] * scale:.2g} to "
+                f"{GYRATION[1] * scale:.2g}: check that it is in kg m^2."
+            )
         return found
 
     def regions(self, value: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -153,6 +179,9 @@ class _Reader:
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
             raise self.fail(f"two regions are named {twice!r}; rename one of them.")
+        twice = next((name for name in classes if classes.count(name) > 1), None)
+        if twice is not None:
+            raise self.fail(f"two regions have the grasp_class {twice!r}; give each region its own.")
         return tuple(names), tuple(classes)
 
     def mesh(self, name: Any) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"] | None]:
@@ -163,6 +192,21 @@ class _Reader:
         if np.abs(mesh.vertices).max() > LARGEST:
             raise InputError(f"{self.folder / name} reaches farther than {LARGEST} m from its origin: use metres.")
         return mesh, labels
+
+    def hull(self, name: Any) -> trimesh.Trimesh:
+        """A convex mesh that PhysX can take; each file is read once."""
+        if isinstance(name, str) and name in self.hulls:
+            return self.hulls[name]
+        path = self.folder / str(name)
+        if isinstance(name, str) and FILE_NAME.fullmatch(name) and os.path.isfile(path):
+            check_size(path, "convex hull", MOST_HULL_BYTES)
+        hull, _ = self.mesh(name)
+        if len(hull.vertices) > MOST_CORNERS:
+            raise InputError(f"{path} has {len(hull.vertices)} vertices; a hull may have at most {MOST_CORNERS}.")
+        if not hull.is_convex:
+            raise InputError(f"{path} is not convex: cut it into convex pieces.")
+        self.hulls[name] = hull
+        return hull
 
     def closed(self, name: Any) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"] | None]:
         """A closed surface with outward faces."""
@@ -191,22 +235,25 @@ class _Reader:
 
     def pieces(self, value: Any, regions: tuple[str, ...]) -> tuple[Piece, ...]:
         """The convex collision shapes."""
-        return tuple(self.piece(row, regions, f"piece {i}") for i, row in enumerate(self.rows(value, "pieces")))
+        found = tuple(self.piece(row, regions, f"piece {i}") for i, row in enumerate(self.rows(value, "pieces")))
+        faces = sum(len(piece.shape.faces) for piece in found if isinstance(piece.shape, trimesh.Trimesh))
+        if faces > MOST_FACES:
+            raise self.fail(f"the hulls of its pieces have {faces} faces; reduce them to at most {MOST_FACES}.")
+        return found
 
     def piece(self, row: Any, regions: tuple[str, ...], where: str) -> Piece:
         """One collision shape: a primitive, or the file of a convex hull."""
         self.check.keys(row, "hull" if isinstance(row, dict) and "mesh" in row else "primitive", where)
         region = self.check.one_of(row["region"], regions, f"the region of {where}")
         if "mesh" in row:
-            hull, _ = self.mesh(row["mesh"])
-            if not hull.is_convex:
-                raise InputError(f"{self.folder / row['mesh']} is not convex: cut it into convex pieces.")
-            return Piece(region, hull)
+            return Piece(region, self.hull(row["mesh"]))
         kind = self.check.one_of(row["shape"], tuple(SIZES), f"the shape of {where}")
         x, y, z = self.check.numbers(row["position"], 3, f"the position of {where}")
         size = self.check.numbers(row["size"], SIZES[kind], f"the size of {where}")
         if min(size) <= 0:
             raise self.fail(f"the size of {where} must be positive.")
+        if math.hypot(x, y, z) + max(size) > LARGEST:
+            raise self.fail(f"{where} reaches farther than {LARGEST} m from the origin: use metres.")
         return Piece(
             region, Shape(kind, (x, y, z), self.quaternion(row["quaternion"], f"the quaternion of {where}"), size)
         )

@@ -29,7 +29,6 @@ from dora.affordance.reach.approach_paths import (
     ReachSettings,
     attempts,
 )
-from dora.errors import InputError
 from dora.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_apply,
@@ -98,14 +97,12 @@ class Reach:
         settings: ReachSettings | None = None,
         start: str = "home",
     ):
-        if start not in robot.postures:
-            raise InputError(f"{robot.name!r} has no posture {start!r}; choose from {', '.join(robot.postures)}.")
         self.robot, self.settings = robot, settings or ReachSettings()
         self.digest = "" if obj is None else obj.digest
         self.folder = None if obj is None else obj.folder
         self.base = base
         self.pieces: tuple[Shape | trimesh.Trimesh, ...] = () if obj is None else tuple(p.shape for p in obj.pieces)
-        self.kinematics = InverseKinematics(robot, robot.postures[start].arm)
+        self.kinematics = InverseKinematics(robot, robot.posture(start).arm)
         self.start = self.kinematics.start
         self._base_p, self._base_q = (torch.tensor(part, dtype=torch.float32) for part in base)
         up = torch.tensor([0.0, 0.0, 1.0])

@@ -74,7 +74,7 @@ class Arm:
     ):
         self.name, self.spec, self.agent, self.guide, self._grid, self._tables = name, spec, agent, guide, grid, tables
         self._starts = starts
-        self.posture = agent.description.postures[start_posture(spec)]
+        self.posture = agent.description.posture(start_posture(spec))
         base = (torch.tensor([x], dtype=torch.float32, device=agent.device) for x in (spec.position, spec.quaternion))
         self.home: Pose = compose((next(base), next(base)), agent.posture_wrist(start_posture(spec)))
 

@@ -52,5 +52,5 @@ def with_waiting_hand(candidates: GraspCandidates, robot: RobotDescription, post
     """The same grasps before whose closing all flexing joints are as in a posture of the robot: wide open, to let
     something fall in between fingers and thumb. The joints that spread the fingers are the candidates'."""
     flexes = torch.tensor(flexion(robot) != 0, device=candidates.pregrasp.device)
-    waiting = torch.tensor(robot.postures[posture].hand).to(candidates.pregrasp)
+    waiting = torch.tensor(robot.posture(posture).hand).to(candidates.pregrasp)
     return replace(candidates, pregrasp=torch.where(flexes, waiting, candidates.pregrasp))
