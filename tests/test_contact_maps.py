@@ -40,6 +40,15 @@ def test_maps_are_packed_without_loss(points: int):
     assert tensors == {}
 
 
+def test_maps_that_could_not_be_read_again_are_not_written(jug: GraspCandidates, tmp_path: Path):
+    maps = torch.zeros((), dtype=torch.uint8).expand(2**16 + 1, 2**12)
+    with pytest.raises(InputError, match=r"65537 contact maps of 4096 points .*keep at most 65536 candidates"):
+        pack(maps)
+    with pytest.raises(InputError, match="2097152 points each are too large"):
+        replace(jug.select([0]), contact_map=torch.zeros(1, 2 * MOST_POINTS, dtype=torch.uint8)).save(tmp_path / "a")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_file_keeps_the_maps_and_little_else(jug: GraspCandidates, tmp_path: Path):
     path = tmp_path / "jug.safetensors"
     jug.save(path)

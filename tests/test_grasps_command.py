@@ -44,6 +44,7 @@ def script() -> ModuleType:
         ("", "--object or --mesh"),
         ("--object jug --mesh a.stl", "--object or --mesh"),
         ("--object jug --num 0", "--num is 0"),
+        ("--object jug --num 65537", "--num is 65537"),
         ("--object jug --baselines -1", "--baselines is -1"),
         ("--object jug --by-region -1", "--by-region is -1"),
         ("--object jug --by-region 8", "--validate sapien with it"),

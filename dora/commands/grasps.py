@@ -17,6 +17,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from dora.affordance.contact_maps import map_bundled_set
+from dora.affordance.maps.affordance_map import COUNT
+from dora.affordance.maps.packed_maps import MOST_CELLS
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.affordance.objects.importing import import_mesh, size_in_words
@@ -37,7 +39,7 @@ from dora.tools.task_ranking import rank_bundled_set, tasks_of, usable_in_task
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 RANGES = {
-    "num": (1, 100_000),
+    "num": (1, MOST_CELLS // COUNT),
     "seed": (0, LARGEST_SEED),
     "baselines": (0, 100_000),
     "by_region": (0, 100_000),

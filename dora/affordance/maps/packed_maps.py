@@ -18,7 +18,17 @@ MOST_POINTS, MOST_CELLS = 2**20, 2**28
 
 
 def pack(maps: UInt8[Tensor, "c p"]) -> dict[str, Tensor]:
-    """Tensors of a file, 3 bytes per touched point if a map has at most 2^15 points."""
+    """Tensors of a file, 3 bytes per touched point if a map has at most 2^15 points.
+
+    Raises:
+        InputError: there are more points than a file may have.
+    """
+    rows, points = maps.shape
+    if points > MOST_POINTS or rows * points > MOST_CELLS:
+        raise InputError(
+            f"{rows} contact maps of {points} points each are too large for a file of {MOST_CELLS} points, at "
+            f"most {MOST_POINTS} of each: keep at most {MOST_CELLS // points} candidates, for instance the best ones."
+        )
     row, point = maps.cpu().nonzero().unbind(1)
     return {
         COUNT: torch.bincount(row, minlength=len(maps)).int(),
