@@ -212,6 +212,27 @@ def test_a_region_without_a_face_on_the_surface_is_named(tmp_path: Path):
     assert "the region 'core' lies inside other parts or on what was dropped, and is left out" in found.notes
 
 
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["a" * 300, "b"], r"mug.obj has the label 'aaa.*; give names of at most 200 characters"),
+        ([f"part {chr(0x4E00 + i)}" for i in range(257)], r"mug.obj has 257 different labels; give at most 256"),
+    ],
+    ids=["long", "many"],
+)
+def test_names_of_parts_that_no_folder_could_have_are_refused(names: list[str], words: str, tmp_path: Path):
+    rows = "".join(f"o {name}\nf 1 2 3\n" for name in names)
+    (tmp_path / "mug.obj").write_text(f"v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\n{rows}")
+    with pytest.raises(InputError, match=words):
+        import_mesh(tmp_path / "mug.obj", cache_dir=tmp_path)
+
+
+def test_the_class_of_a_long_name_is_no_longer_than_a_name_may_be():
+    found = grasp_classes(["a" * 200, "a" * 199 + "b", "c" * 10])
+    assert [len(name) for name in found.values()] == [195, 198, 15]
+    assert len(set(found.values())) == 3
+
+
 COPIES = {
     "handle.001": "handle", "handle_2": "handle", "handle 3": "handle", "handle (4)": "handle",
     "handle.001_1": "handle", "handle": "handle", "001": "001", "把手.002": "把手", "part-b": "part-b", "2nd": "2nd",

@@ -115,7 +115,11 @@ def import_mesh(
     check_weight(path, mass, density)
     raw, names = read_mesh(path, keep_order=labels is not None)
     _check_size(raw, path, scale, units)
-    given = FaceLabels.from_names(names) if labels is None else read_labels(Path(labels), raw.triangles_center)
+    given = (
+        FaceLabels.from_names(names, source=str(path))
+        if labels is None
+        else read_labels(Path(labels), raw.triangles_center)
+    )
     raw = trimesh.Trimesh(raw.vertices * (scale * UNITS[units]), raw.faces, process=False)
     repaired = repair(raw, given.index, str(path))
     mesh = repaired.mesh

@@ -22,6 +22,8 @@ MOST_BYTES = 64_000_000
 """Size of a .npy file of labels above which it is not read [bytes]."""
 MOST_REGIONS, LONGEST_NAME = 256, 200
 """Largest number of regions, and of characters in the name of one [1]."""
+LONGEST_CLASS = LONGEST_NAME - len("No256Grasp")
+"""Number of characters of a grasp class without its end, after which the rest of a long name is left out [1]."""
 LARGEST_NUMBER = 1e9
 """Coordinates are smaller than this, in the unit of length of the mesh file."""
 WANTED = "handle"
@@ -58,10 +60,15 @@ class FaceLabels:
             source: what the message of an error calls the source of the target.
 
         Raises:
-            InputError: the target is none of the names.
+            InputError: the target is none of the names, there are more than `MOST_REGIONS`, or one is too long.
         """
         tidy = {name: _tidy(name, source) for name in dict.fromkeys(names)}
         distinct = tuple(dict.fromkeys(tidy.values()))
+        if len(distinct) > MOST_REGIONS:
+            raise InputError(f"{source} has {len(distinct)} different labels; give at most {MOST_REGIONS}.")
+        long = next((name for name in distinct if len(name) > LONGEST_NAME), None)
+        if long is not None:
+            raise InputError(f"{source} has the label {shown(long)}; give names of at most {LONGEST_NAME} characters.")
         target = None if target is None else _tidy(str(target), source)
         if target is None:
             target = WANTED if WANTED in distinct else distinct[0]
@@ -91,7 +98,7 @@ def grasp_class(label: str) -> str:
     """Grasp class of a label in any script: "handle" -> "HandleGrasp", "left ear" -> "LeftEarGrasp"."""
     letters = unicodedata.normalize("NFC", label)
     words = "".join(c if unicodedata.category(c)[0] in "LMN" else " " for c in letters).split()
-    return "".join(word[:1].upper() + word[1:] for word in words or [NAMELESS]) + "Grasp"
+    return "".join(word[:1].upper() + word[1:] for word in words or [NAMELESS])[:LONGEST_CLASS] + "Grasp"
 
 
 def grasp_classes(labels: Iterable[str]) -> dict[str, str]:
@@ -123,13 +130,7 @@ def read_labels(path: Path, centers: Float[np.ndarray, "f 3"]) -> FaceLabels:
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"labels cannot be read from {path}: give a file ending in {', '.join(readers)}.")
-    labels = reader(path, centers)
-    if len(labels.names) > MOST_REGIONS:
-        raise InputError(f"{path} has {len(labels.names)} different labels; give at most {MOST_REGIONS}.")
-    for name in labels.names:
-        if len(name) > LONGEST_NAME:
-            raise InputError(f"{path} has the label {shown(name)}; give names of at most {LONGEST_NAME} characters.")
-    return labels
+    return reader(path, centers)
 
 
 def _from_text(path: Path, centers: np.ndarray) -> FaceLabels:
