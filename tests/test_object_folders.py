@@ -290,6 +290,38 @@ def test_meshes_that_are_no_part_any_more_are_removed(folder: Path):
     assert {path.name for path in folder.iterdir()} == {"object.toml", "mesh.ply"}
 
 
+@pytest.mark.parametrize("count", range(5))
+def test_a_folder_that_is_half_written_is_as_before_or_refused(
+    count: int, folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    before, own, left = read_object_folder(folder), os.replace, iter(range(20))
+
+    def cut(source: Any, target: Any) -> None:
+        if Path(target).parent == folder and next(left) == count:
+            raise KeyboardInterrupt
+        own(source, target)
+
+    monkeypatch.setattr(os, "replace", cut)
+    larger = replace(before, mesh=trimesh.Trimesh(2 * before.mesh.vertices, before.mesh.faces), mass=9.0)
+    with pytest.raises(KeyboardInterrupt):
+        write_object_folder(larger, folder)
+    monkeypatch.undo()
+    if count:
+        with pytest.raises(InputError, match="the format is 'unfinished', not 'dora-object 1'; write the folder again"):
+            read_object_folder(folder)
+    else:
+        assert_same(read_object_folder(folder), before)
+    write_object_folder(larger, folder)
+    assert read_object_folder(folder).mass == 9.0
+
+
+def test_what_could_not_be_read_again_is_not_written(folder: Path):
+    before = read_object_folder(folder)
+    with pytest.raises(InputError, match="mass is 1e"):
+        write_object_folder(replace(before, mass=1e8), folder)
+    assert_same(read_object_folder(folder), before)
+
+
 def test_files_of_others_are_not_replaced(folder: Path, tmp_path: Path):
     (folder / "hull-old.ply").write_text("mine")
     write_object_folder(load_object(folder), folder)

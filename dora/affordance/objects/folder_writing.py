@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import os
 import re
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
 from dora.affordance.objects.affordance_object import AffordanceObject, Piece
-from dora.affordance.objects.folder_reading import FORMAT, OBJECT_FILE
+from dora.affordance.objects.folder_reading import FORMAT, OBJECT_FILE, read_object_folder
 from dora.affordance.objects.mesh_files import write_ply
 from dora.errors import InputError
 from dora.files import write_bytes
@@ -19,20 +20,25 @@ MESH, SOLID, HULL = "mesh.ply", "solid.ply", "hull-{}.ply"
 """Names of the meshes: the surface, the same without cavities, and the hull that is the piece of that number."""
 WRITTEN = re.compile(r"mesh\.ply|solid\.ply|hull-\d+\.ply")
 """Names of all files of meshes that are written here."""
+UNFINISHED = (
+    b'format = "unfinished"\nname = ""\nmesh = ""\ntarget = ""\nmass = 0\ninertia = []\nregions = []\npieces = []\n'
+)
+"""The object.toml while meshes are replaced, so that a folder of old and new files is refused."""
 
 
 def write_object_folder(obj: AffordanceObject, folder: Path | str) -> Path:
     """Write an object as a folder from which `load_object` reads it with every number the same; returns object.toml.
 
     The object gets the folder's name. Grasps and reach tables in the folder stay; meshes that are no part of the object
-    any more are removed.
+    any more are removed. If writing is cut short, the folder is as before or is refused when it is read.
 
     Args:
         obj: made by `assemble` or `import_object`, or loaded.
         folder: is made if it does not exist.
 
     Raises:
-        InputError: the folder cannot be written, or is no folder of an object and has files of these names.
+        InputError: the object could not be read again, or the folder cannot be written, or is no folder of an object
+            and has files of these names.
     """
     folder = Path(folder).resolve()
     check_object_folder(folder)
@@ -40,6 +46,29 @@ def write_object_folder(obj: AffordanceObject, folder: Path | str) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot make the folder {folder} ({error.strerror}): choose another one.") from error
+    try:
+        with tempfile.TemporaryDirectory(prefix=".new-", dir=folder) as place:
+            new = Path(place) / folder.name
+            new.mkdir()
+            try:
+                kept = _write(obj, new)
+                read_object_folder(new)
+            except InputError as error:
+                raise InputError(str(error).replace(str(new), str(folder))) from error
+            write_bytes(folder / OBJECT_FILE, UNFINISHED)
+            for name in sorted(kept):
+                os.replace(new / name, folder / name)
+            os.replace(new / OBJECT_FILE, folder / OBJECT_FILE)
+    except OSError as error:
+        raise InputError(f"cannot write {folder} ({error.strerror}): free some space and write it again.") from error
+    for old in folder.glob("*.ply"):
+        if WRITTEN.fullmatch(old.name) and old.name not in kept:
+            old.unlink()
+    return folder / OBJECT_FILE
+
+
+def _write(obj: AffordanceObject, folder: Path) -> set[str]:
+    """Write the files of an object into an empty folder; returns the names of its meshes."""
     write_ply(folder / MESH, obj.mesh, obj.face_labels)
     kept = {MESH}
     if obj.solid is not obj.mesh:
@@ -50,10 +79,7 @@ def write_object_folder(obj: AffordanceObject, folder: Path | str) -> Path:
             write_ply(folder / HULL.format(index), piece.shape)
             kept.add(HULL.format(index))
     write_bytes(folder / OBJECT_FILE, object_toml(obj, folder.name).encode())
-    for old in folder.glob("*.ply"):
-        if WRITTEN.fullmatch(old.name) and old.name not in kept:
-            old.unlink()
-    return folder / OBJECT_FILE
+    return kept
 
 
 def check_object_folder(folder: Path, *sources: Path | None) -> None:
