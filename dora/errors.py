@@ -65,9 +65,21 @@ class WorkerFailure(RunFailure):
     """A worker process died, hangs, or raised something; this process is well."""
 
 
+class _Short(reprlib.Repr):
+    """Short texts of values, of those too that have no `repr`."""
+
+    def repr1(self, x: Any, level: int) -> str:
+        """The text of a value in a value; its type in place of a `repr` that fails, as that of a huge integer does."""
+        try:
+            return super().repr1(x, level)
+        except Exception:  # whatever the class of the value raises
+            return f"<{type(x).__name__}>"
+
+
 def shown(value: object) -> str:
-    """A value as a message shows it: its `repr`, cut to a few dozen characters and a few levels."""
-    short = reprlib.Repr()
+    """A value as a message shows it: its `repr`, cut to a few dozen characters and a few levels; its type if it has
+    none."""
+    short = _Short()
     short.maxstring = short.maxother = LONGEST_VALUE
     short.maxlevel = DEEPEST_VALUE
     return short.repr(value)

@@ -13,6 +13,7 @@ import json
 import math
 import tomllib
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,40 @@ UNICODE, LAST_CHARACTER = {"<": "<u4", ">": ">u4", "=": "u4"}, 0x10FFFF
 """Types of the codes of characters by byte order, and the largest code."""
 SCALARS = (str, int, float, bool, type(None))
 """Types of values besides lists and mappings."""
-_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+MOST_BITS = 1000
+"""Largest number of bits of an integer, so that each can be made a float and be printed."""
+_Parser: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_Parser):
+    """Makes values of YAML; refuses a key that a mapping has twice, and takes 1:30 as a text, not as base 60."""
+
+    def get_single_node(self) -> Any:
+        """The root of the only document, before merge keys (<<) are resolved."""
+        root = super().get_single_node()
+        self._check_keys(root)
+        return root
+
+    def _check_keys(self, node: Any) -> None:
+        found = set()
+        for part in node.value if isinstance(node, yaml.CollectionNode) else ():
+            for each in part if isinstance(part, tuple) else (part,):
+                self._check_keys(each)
+            if isinstance(part, tuple) and isinstance(part[0], yaml.ScalarNode) and not part[0].tag.endswith(":merge"):
+                key = self.construct_object(part[0])
+                if key in found:
+                    raise yaml.YAMLError(f"line {part[0].start_mark.line + 1} has the key {shown(key)} again")
+                found.add(key)
+
+    def number(self, node: Any) -> Any:
+        """A number; a text where it would be one to the base 60, which takes quadratic time."""
+        text = self.construct_scalar(node)
+        make = self.construct_yaml_int if node.tag.endswith(":int") else self.construct_yaml_float
+        return text if ":" in text else make(node)
+
+
+for _kind in ("int", "float"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _Loader.number)
 
 
 def read_bytes(path: Path, what: str, most: int = MOST_TEXT) -> bytes:
@@ -121,11 +155,20 @@ def parse_json(text: str, source: str) -> Any:
         source: names it in messages.
 
     Raises:
-        InputError: it is no JSON, or is too deep or too large.
+        InputError: it is no JSON, is too deep or too large, or has a key twice in a mapping.
     """
     if text.count(",") > MOST_VALUES:
         raise InputError(f"{source} holds more than {MOST_VALUES} values: reduce it.")
-    return checked(_parsed(json.loads, text, "JSON", source), source, MOST_VALUES)
+    content = _parsed(lambda text: json.loads(text, object_pairs_hook=_mapping), text, "JSON", source)
+    return checked(content, source, MOST_VALUES)
+
+
+def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The mapping of these keys and values; ValueError if it has a key twice."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError(f"a mapping has the key {shown(Counter(key for key, _ in pairs).most_common(1)[0][0])} twice")
+    return found
 
 
 def read_toml(path: Path, what: str, most: int = MOST_SETTINGS) -> dict[str, Any]:
@@ -138,8 +181,8 @@ def read_toml(path: Path, what: str, most: int = MOST_SETTINGS) -> dict[str, Any
 
 
 def read_yaml(path: Path, what: str, most: int = MOST_SETTINGS) -> Any:
-    """Content of a YAML file; arguments and errors as for `read_bytes`, and for what is no YAML, too deep, or too large
-    with its aliases written out."""
+    """Content of a YAML file; arguments and errors as for `read_bytes`, and for what is no YAML, too deep, too large
+    with its aliases written out, or has a key twice in a mapping."""
     text = read_text(path, what, most)
     _parsed(lambda text: _check_yaml(text, str(path)), text, "YAML", str(path))
     content = _parsed(lambda text: yaml.load(text, _Loader), text, "YAML", str(path))
@@ -161,7 +204,7 @@ def _check_yaml(text: str, source: str) -> None:
     open_nodes: list[tuple[str | None, int]] = []  # anchor, and values so far, of each list and mapping
     sizes: dict[str, int] = {}
     total = 0
-    for event in yaml.parse(text, _Loader):
+    for event in yaml.parse(text, _Parser):
         size = 0
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in sizes:
@@ -184,7 +227,8 @@ def _check_yaml(text: str, source: str) -> None:
 
 
 def checked(content: Any, source: str, most: int) -> Any:
-    """Plain data, if they are of bounded depth and number, and hold nothing but lists, mappings, texts and numbers.
+    """Plain data, if they are of bounded depth and number, and hold nothing but lists, mappings, texts and numbers
+    of bounded size.
 
     Raises:
         InputError: saying what is wrong.
@@ -203,6 +247,8 @@ def checked(content: Any, source: str, most: int) -> Any:
                 below += value.values()
             elif isinstance(value, list):
                 below += value
+            elif isinstance(value, int) and value.bit_length() > MOST_BITS:
+                raise InputError(f"{source} holds a whole number of more than {MOST_BITS} bits: correct it.")
             elif not isinstance(value, SCALARS):
                 kind = type(value).__name__
                 raise InputError(f"{source} holds a {kind}; only lists, mappings, texts and numbers are read.")
@@ -325,10 +371,8 @@ class TomlTables:
     def text(self, value: Any, where: str, printable: bool = False) -> str:
         """A text that is neither empty nor long, and can be printed if that is asked for."""
         if not isinstance(value, str) or not 0 < len(value) <= LONGEST_TEXT or (printable and not value.isprintable()):
-            words = (
-                f"a text that can be printed, of 1 to {LONGEST_TEXT}" if printable else f"a text of 1 to {LONGEST_TEXT}"
-            )
-            raise self.fail(f"{where} must be {words} characters.")
+            kind = "a text that can be printed," if printable else "a text"
+            raise self.fail(f"{where} must be {kind} of 1 to {LONGEST_TEXT} characters.")
         return value
 
     def one_of(self, value: Any, known: tuple[str, ...], where: str) -> Any:
