@@ -296,6 +296,14 @@ def test_a_urdf_with_other_joints_than_the_description_is_refused(tmp_path, regi
         make("physx_cpu", robot_uids="other")
 
 
+def test_what_only_the_simulator_reads_is_refused_in_one_sentence(tmp_path, monkeypatch, registered):
+    file = copied("odd_hand", tmp_path) / "robot.urdf"
+    file.write_text(file.read_text().replace("<limit", "<safety_controller/><limit", 1))
+    monkeypatch.setenv("DORA_ROBOTS", str(tmp_path))
+    with pytest.raises(InputError, match=f"the simulator cannot read {file} .ValueError: Missing .*: correct it"):
+        make("physx_cpu", robot_uids="odd_hand")
+
+
 @pytest.mark.parametrize("mode", ["pd_joint_pos", "pd_joint_pos_coupled"])
 def test_the_action_of_a_keyframe_leads_to_the_keyframe(mode):
     env = make("physx_cpu_batch", control_mode=mode)

@@ -6,19 +6,29 @@ import math
 import os
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 
 from dora.errors import InputError, shown
-from dora.geometry.rotations import matrix_from_quaternion, quaternion_from_rpy, quaternion_multiply
-from dora.reading import read_xml
+from dora.geometry.rotations import matrix_from_quaternion, quaternion_multiply
+from dora.reading import read_text, read_xml
 from dora.robot.shapes import Shape, merge_capsules
+from dora.robot.urdf_values import (
+    THINNEST,
+    check_inertial,
+    check_material,
+    check_visual,
+    child,
+    lengths,
+    numbers,
+    origin,
+    text,
+)
 
 MOVING = ("revolute", "prismatic", "continuous")
 """Types of joints with a degree of freedom."""
@@ -26,8 +36,8 @@ MOST_LINKS, MOST_SHAPES = 1000, 200
 """Largest number of links of a robot, and of collision shapes of a link [1]."""
 LIMITS = ("lower", "upper", "velocity", "effort")
 """Attributes of a joint's limits."""
-LARGEST_NUMBER = 1e9
-"""Every number of a URDF is smaller, in SI units; a larger limit stands for none, and has to be left out."""
+LEAST_AXIS = 1e-3
+"""Length of a joint's axis below which the simulator takes another one [1]."""
 Z_TO_X = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)
 """Rotation (quaternion wxyz) of local x, the axis of a `Shape`, into z, the axis of a URDF cylinder."""
 
@@ -102,16 +112,24 @@ def read_urdf(path: Path) -> UrdfModel:
     """Read a URDF file.
 
     Raises:
-        InputError: there is no such file, it is too large, it is not XML, a required element is missing, a number is
-            not finite, a name is used twice, a lower limit exceeds its upper limit, or the links do not form one tree.
+        InputError: there is no such file, it is too large, it is no text in UTF-8, it is not XML, a required element is
+            missing, a number is not finite, a size, mass or inertia is none, a name is used twice, a lower limit
+            exceeds its upper limit, or the links do not form one tree.
     """
     if not os.path.isfile(path):
         raise InputError(f"{path} does not exist; name the URDF file in robot.toml.")
+    read_text(path, "URDF")  # the simulator reads no other encoding
     robot = read_xml(path, "URDF")
     try:
         joints = [_joint(element) for element in robot.findall("joint")]
-        links = [_text(element, "name") for element in robot.findall("link")]
-        shapes = {_text(link, "name"): _shapes(link) for link in robot.findall("link")}
+        links = [text(element, "name") for element in robot.findall("link")]
+        shapes = {text(link, "name"): _shapes(link) for link in robot.findall("link")}
+        for link in robot.findall("link"):
+            check_inertial(link)
+            for visual in link.findall("visual"):
+                check_visual(visual)
+        for material in robot.findall("material"):
+            check_material(material)
     except ValueError as error:
         raise InputError(f"{path} is not a URDF that Dora can read: {error}.") from error
     _check_tree(path, links, joints)
@@ -150,25 +168,28 @@ def _check_tree(path: Path, links: list[str], joints: list[UrdfJoint]) -> None:
 
 
 def _joint(element: ElementTree.Element) -> UrdfJoint:
-    kind, name = _text(element, "type"), _text(element, "name")
+    kind, name = text(element, "type"), text(element, "name")
     limit, axis = element.find("limit"), element.find("axis")
     if kind not in (*MOVING, "fixed"):
         raise ValueError(f"joint {name!r} is of the type {shown(kind)}, not one of {', '.join(MOVING)}, fixed")
     if kind in MOVING and limit is None:
         raise ValueError(f"joint {name!r} has no <limit>")
     try:
-        values = {} if limit is None else {key: _float(limit, key) for key in LIMITS if key in limit.attrib}
+        values = {} if limit is None else {key: numbers(limit, key, 1)[0] for key in LIMITS if key in limit.attrib}
     except ValueError as error:
         raise ValueError(f"joint {name!r} needs finite limits, velocity and effort: {error}") from error
-    direction = (1.0, 0.0, 0.0) if axis is None else _floats(axis, "xyz")
-    if kind in MOVING and not any(direction):
+    direction = (1.0, 0.0, 0.0) if axis is None else numbers(axis, "xyz")
+    if kind in MOVING and math.hypot(*direction) < LEAST_AXIS:
         raise ValueError(f"the axis of joint {name!r} has no direction")
+    for dynamics in element.findall("dynamics"):
+        if any(numbers(dynamics, key, 1)[0] < 0 for key in ("damping", "friction") if key in dynamics.attrib):
+            raise ValueError(f"joint {name!r} has a negative damping or friction")
     return UrdfJoint(
         name=name,
         kind=kind,
-        parent=_text(_child(element, "parent"), "link"),
-        child=_text(_child(element, "child"), "link"),
-        origin=_pose_matrix(*_origin(element)),
+        parent=text(child(element, "parent"), "link"),
+        child=text(child(element, "child"), "link"),
+        origin=_pose_matrix(*origin(element)),
         axis=np.array(direction),
         **{key: values.get(key, 0.0) for key in LIMITS},
     )
@@ -183,36 +204,20 @@ def _shapes(link: ElementTree.Element) -> tuple[Shape, ...]:
 
 
 def _shape(collision: ElementTree.Element) -> Shape:
-    geometry = next(iter(_child(collision, "geometry")), None)
+    geometry = next(iter(child(collision, "geometry")), None)
     if geometry is None:
         raise ValueError("a <geometry> is empty")
-    if geometry.tag not in _SIZES:
-        raise ValueError(f"collision geometry <{geometry.tag}> is not a box, sphere or cylinder")
-    kind, size = _SIZES[geometry.tag](geometry)
-    if min(size) <= 0:
-        raise ValueError(f"a collision <{geometry.tag}> has a size that is not positive")
-    position, quaternion = _origin(collision)
-    if kind == "cylinder":
-        quaternion = _compose(quaternion, Z_TO_X)
-    return Shape(kind, position, quaternion, size)
-
-
-_SIZES: dict[str, Callable[[ElementTree.Element], tuple[Literal["box", "sphere", "cylinder"], tuple[float, ...]]]] = {
-    "box": lambda e: ("box", tuple(v / 2 for v in _floats(e, "size"))),
-    "sphere": lambda e: ("sphere", (_float(e, "radius"),)),
-    "cylinder": lambda e: ("cylinder", (_float(e, "radius"), _float(e, "length") / 2)),
-}
-"""Kind and `Shape.size` of each geometry element."""
-
-
-def _origin(
-    element: ElementTree.Element,
-) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
-    """Position [m] and quaternion (wxyz) of an element's <origin>, the identity when it has none."""
-    origin = element.find("origin")
-    xyz = (0.0, 0.0, 0.0) if origin is None or "xyz" not in origin.attrib else _floats(origin, "xyz")
-    rpy = (0.0, 0.0, 0.0) if origin is None or "rpy" not in origin.attrib else _floats(origin, "rpy")
-    return (xyz[0], xyz[1], xyz[2]), quaternion_from_rpy(*rpy)
+    position, quaternion = origin(collision)
+    match geometry.tag:
+        case "box":
+            x, y, z = lengths(geometry, "collision", THINNEST)
+            return Shape("box", position, quaternion, (x / 2, y / 2, z / 2))
+        case "sphere":
+            return Shape("sphere", position, quaternion, lengths(geometry, "collision", THINNEST))
+        case "cylinder":
+            radius, length = lengths(geometry, "collision", THINNEST)
+            return Shape("cylinder", position, _compose(quaternion, Z_TO_X), (radius, length / 2))
+    raise ValueError(f"collision geometry <{geometry.tag}> is not a box, sphere or cylinder")
 
 
 def _pose_matrix(position: tuple[float, ...], quaternion: tuple[float, ...]) -> np.ndarray:
@@ -227,35 +232,3 @@ def _compose(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, 
         torch.tensor(a, dtype=torch.float64), torch.tensor(b, dtype=torch.float64)
     ).tolist()
     return w, x, y, z
-
-
-def _child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
-    child = element.find(tag)
-    if child is None:
-        raise ValueError(f"<{element.tag} name={element.get('name')!r}> has no <{tag}>")
-    return child
-
-
-def _text(element: ElementTree.Element, attribute: str) -> str:
-    if attribute not in element.attrib:
-        raise ValueError(f"a <{element.tag}> has no attribute {attribute!r}")
-    return element.attrib[attribute]
-
-
-def _floats(element: ElementTree.Element, attribute: str) -> tuple[float, ...]:
-    words = _text(element, attribute).split()
-    if len(words) != 3:
-        raise ValueError(f"attribute {attribute!r} of a <{element.tag}> needs three numbers")
-    return tuple(_number(word) for word in words)
-
-
-def _float(element: ElementTree.Element, attribute: str) -> float:
-    return _number(_text(element, attribute))
-
-
-def _number(text: str) -> float:
-    """A number, which has to be below `LARGEST_NUMBER`."""
-    value = float(text)
-    if not abs(value) < LARGEST_NUMBER:
-        raise ValueError(f"the number {shown(text)} is not finite, or too large")
-    return value

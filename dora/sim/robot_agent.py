@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Articulation, Link
 from sapien.physx import PhysxMaterial
 from torch import Tensor
 
-from dora.errors import InputError
+from dora.errors import InputError, said
 from dora.geometry.poses import Pose, compose
 from dora.geometry.rotations import quaternion_apply, quaternion_from_matrix, quaternion_multiply
 from dora.robot import RobotDescription
@@ -89,7 +89,12 @@ class DescribedRobot(BaseAgent):
         loader = self.scene.create_urdf_loader()
         loader.name = name
         loader.fix_root_link = self.fix_root_link
-        builder = loader.parse(str(self.urdf_path))["articulation_builders"][0]
+        try:
+            builder = loader.parse(str(self.urdf_path))["articulation_builders"][0]
+        except Exception as error:  # the reader raises whatever it meets in elements that only it reads
+            raise InputError(
+                f"the simulator cannot read {self.urdf_path} ({said(type(error).__name__, error)[:-1]}): correct it."
+            ) from error
         # The tips are frames, not bodies: as links they would cost PhysX 6 % of a step.
         frames = {f.tip for f in self.description.fingers.values()}
         builder.link_builders = [link for link in builder.link_builders if link.name not in frames]
