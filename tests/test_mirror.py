@@ -166,6 +166,24 @@ def _replace(path: Path, old: str, new: str) -> None:
     path.write_text(path.read_text().replace(old, new))
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_urdf_in_any_unicode_is_mirrored(copied: Path, encoding: str):
+    text = (copied / "robot.urdf").read_text()
+    written = f'<?xml version="1.0" encoding="{encoding[:6].rstrip("-")}"?><!-- \u00fc -->' + text.split("?>", 1)[1]
+    (copied / "robot.urdf").write_text(written, encoding=encoding)
+    write_mirrored(copied, copied.parent / "image")
+    assert load_robot(copied.parent / "image").model.links[0] == "base_link"
+
+
+def test_a_urdf_in_another_encoding_is_refused(copied: Path):
+    text = (copied / "robot.urdf").read_text()
+    written = '<?xml version="1.0" encoding="ISO-8859-1"?><!-- \u00fc -->' + text.split("?>", 1)[1]
+    (copied / "robot.urdf").write_bytes(written.encode("latin-1"))
+    with pytest.raises(InputError, match=r"robot\.urdf is no UTF-8 text .*: write it again"):
+        write_mirrored(copied, copied.parent / "image")
+    assert not (copied.parent / "image").exists()
+
+
 def test_a_robot_can_be_named_by_its_name(right: RobotDescription, tmp_path: Path):
     assert tmp_path / "image/robot.toml" in write_mirrored(Path(right.name), tmp_path / "image")
     with pytest.raises(InputError, match="is the robot itself"):

@@ -24,7 +24,7 @@ import trimesh
 from dora.containers import MOST_FACES, check_container, check_triangles
 from dora.errors import InputError, command
 from dora.files import make_folder, write_bytes
-from dora.reading import read_toml
+from dora.reading import read_text, read_toml
 from dora.robot.build import urdf_number
 from dora.robot.loading import ROBOT_FILE, load_robot
 
@@ -176,12 +176,13 @@ def write_mirrored(source: Path, target: Path) -> list[Path]:
     if target.resolve() == robot.folder:
         raise InputError(f"{target} is the robot itself; give the folder of its image another name.")
     written: dict[Path, bytes] = {}
-    urdf = mirrored_urdf(robot.urdf.read_text(), target.name, robot.name)
+    text = read_text(robot.urdf, "URDF")
+    urdf = mirrored_urdf(text, target.name, robot.name)
     written[target / mirrored_name(robot.urdf.name)] = urdf.encode()
     table = mirrored_table(read_toml(robot.folder / ROBOT_FILE, "robot"), target.name)
     written[target / ROBOT_FILE] = f"# {HEADER.format(name=robot.name)}\n{tomli_w.dumps(table)}".encode()
     written[target / "SOURCE.md"] = SOURCE.format(name=robot.name, image=target.name).encode()
-    for name in sorted({mesh.get("filename", "") for mesh in ET.parse(robot.urdf).iter("mesh")}):
+    for name in sorted({mesh.get("filename", "") for mesh in ET.fromstring(text).iter("mesh")}):
         written[target / mirrored_name(name)] = _mesh_image(robot.folder / name)
     for path, content in written.items():
         make_folder(path.parent)
