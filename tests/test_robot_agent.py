@@ -304,6 +304,15 @@ def test_what_only_the_simulator_reads_is_refused_in_one_sentence(tmp_path, monk
         make("physx_cpu", robot_uids="odd_hand")
 
 
+def test_a_robot_without_the_posture_of_a_task_is_refused_by_the_task(tmp_path, monkeypatch, registered):
+    file = copied("homeless", tmp_path) / "robot.toml"
+    file.write_text(file.read_text().replace("[postures.home]", "[postures.rest]"))
+    monkeypatch.setenv("DORA_ROBOTS", str(tmp_path))
+    with pytest.raises(InputError, match=f"has no posture 'home'; add it to {file}, which has zero, rest"):
+        gym.make("DoraCube-v1", robot_uids="homeless")
+    make("physx_cpu", robot_uids="homeless").close()
+
+
 @pytest.mark.parametrize("mode", ["pd_joint_pos", "pd_joint_pos_coupled"])
 def test_the_action_of_a_keyframe_leads_to_the_keyframe(mode):
     env = make("physx_cpu_batch", control_mode=mode)

@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from dora.errors import InputError
+from dora.errors import InputError, shown
 from dora.robot.shapes import Shape
 from dora.robot.urdf import UrdfModel
 
@@ -127,16 +127,6 @@ class RobotDescription:
     contacts: dict[str, Contact]
     ignored_pairs: frozenset[tuple[str, str]]
 
-    def posture(self, name: str) -> Posture:
-        """A posture by its name.
-
-        Raises:
-            InputError: the robot has none of that name.
-        """
-        if name not in self.postures:
-            raise InputError(f"{self.name!r} has no posture {name!r}; choose from {', '.join(self.postures)}.")
-        return self.postures[name]
-
     @cached_property
     def hand_actuated(self) -> np.ndarray:
         """Indices (n_actuated,) of the hand joints with a drive of their own, ascending."""
@@ -164,6 +154,19 @@ class RobotDescription:
     def reduce_hand(self, hand: Array) -> Array:
         """Targets of the actuated joints (..., n_actuated) from those of all hand joints (..., n_hand) [rad]."""
         return hand[..., self.hand_actuated]
+
+    def posture(self, name: str) -> Posture:
+        """The posture of this name.
+
+        Raises:
+            InputError: the robot has none.
+        """
+        if name not in self.postures:
+            raise InputError(
+                f"robot {self.name!r} has no posture {shown(name)}; add it to {self.folder / 'robot.toml'}, which has "
+                f"{', '.join(self.postures) or 'none'}."
+            )
+        return self.postures[name]
 
     def collision_bits(self) -> dict[str, int]:
         """A bit mask per link such that two links collide exactly when their masks share no bit.

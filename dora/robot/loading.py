@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable
 from functools import cache
 from itertools import combinations
@@ -15,6 +16,7 @@ import dora
 from dora.errors import InputError, shown, suggestion
 from dora.reading import Table, TomlTables, entries, read_toml
 from dora.robot.description import Contact, Coupling, Finger, JointGroup, Posture, RobotDescription
+from dora.robot.structure import faults
 from dora.robot.urdf import UrdfModel, read_urdf
 
 ROBOT_FILE = "robot.toml"
@@ -34,6 +36,16 @@ KEYS = {
     "contact group": (("links", "friction", "restitution", "contact_offset", "rest_offset"), ()),
 }
 """Required and optional keys of each kind of table."""
+
+NAME = re.compile(r"\w[\w .+-]*")
+"""Names of robots: plain, so that they can be names of folders."""
+CONTACT = {
+    "friction": (0.0, 10.0),
+    "restitution": (0.0, 1.0),
+    "contact_offset": (1e-6, 1.0),
+    "rest_offset": (-1.0, 1.0),
+}
+"""Smallest and largest value of each setting of contacts, in the units of `Contact`."""
 
 
 def robot_folders() -> dict[str, Path]:
@@ -70,7 +82,7 @@ def _load(folder: Path) -> RobotDescription:
     path = folder / ROBOT_FILE
     content = read_toml(path, "file about a robot")
     urdf = content.get("urdf", "robot.urdf")
-    if not isinstance(urdf, str) or not (folder / urdf).resolve().is_relative_to(folder):
+    if not isinstance(urdf, str) or not urdf.isprintable() or not (folder / urdf).resolve().is_relative_to(folder):
         raise InputError(f"{path}: urdf is {shown(urdf)}; name a file in the folder of the robot.")
     return _Reader(path, read_urdf(folder / urdf)).robot(content)
 
@@ -91,8 +103,8 @@ class _Reader:
         if twice:
             raise self.fail(f"joint {min(twice)!r} is both in arm and hand; keep it in one of them.")
         shapes = {link: shapes for link, shapes in self.model.shapes.items() if shapes}
-        return RobotDescription(
-            name=self.check.text(content["name"], "name", printable=True),
+        robot = RobotDescription(
+            name=self.name(content["name"]),
             folder=self.path.parent,
             urdf=self.path.parent / content["urdf"],
             model=self.model,
@@ -113,6 +125,15 @@ class _Reader:
             contacts=self.contacts(content["contact"], shapes),
             ignored_pairs=self.pairs(content.get("no_collision", {}), shapes),
         )
+        for fault in faults(robot):
+            raise self.fail(fault)
+        return robot
+
+    def name(self, value: Any) -> str:
+        name = self.check.text(value, "name", printable=True)
+        if not NAME.fullmatch(name):
+            raise self.fail(f"the name is {shown(name)}; use letters, digits, spaces and _ . + - after the first one.")
+        return name
 
     def link(self, name: Any) -> str:
         if not isinstance(name, str) or name not in self.model.links:
@@ -205,10 +226,7 @@ class _Reader:
         found: dict[str, Contact] = {}
         for name, table in self.check.table(groups, "contact").items():
             self.check.keys(table, "contact group", f"contact.{name}")
-            values = {key: table[key] for key in table if key != "links"}
-            contact = Contact(*self.array(
-                [values[key] for key in KEYS["contact group"][0][1:]], 4, f"contact.{name}"
-            ).tolist())  # fmt: skip
+            contact = self.contact(table, f"contact.{name}")
             for link in map(self.link, self.names(table["links"], f"contact.{name}.links")):
                 if link in found:
                     raise self.fail(f"link {link!r} is in two contact groups; keep it in one of them.")
@@ -217,6 +235,17 @@ class _Reader:
         if missing:
             raise self.fail(f"link {missing[0]!r} has collision shapes and is in no contact group; add it.")
         return found
+
+    def contact(self, table: Table, where: str) -> Contact:
+        """The settings of one group."""
+        values = self.array([table[key] for key in CONTACT], len(CONTACT), where).tolist()
+        for value, (key, (least, most)) in zip(values, CONTACT.items(), strict=True):
+            if not least <= value <= most:
+                raise self.fail(f"{where}.{key} is {value:g}; it must be from {least:g} to {most:g}.")
+        contact = Contact(*values)
+        if contact.rest_offset >= contact.contact_offset:
+            raise self.fail(f"{where}.rest_offset must be below its contact_offset.")
+        return contact
 
     def pairs(self, table: Any, shapes: Iterable[str]) -> frozenset[tuple[str, str]]:
         """Link pairs of `no_collision`; links joined by one joint, or by fixed joints, are added."""

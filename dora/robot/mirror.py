@@ -26,7 +26,7 @@ from dora.errors import InputError, command
 from dora.files import make_folder, write_bytes
 from dora.reading import read_text, read_toml
 from dora.robot.build import urdf_number
-from dora.robot.loading import ROBOT_FILE, load_robot
+from dora.robot.loading import NAME, ROBOT_FILE, load_robot
 
 POINT, ANGLES, AXIS = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)
 """What the components of a point, of roll, pitch and yaw, and of an axis of rotation are multiplied by."""
@@ -175,6 +175,8 @@ def write_mirrored(source: Path, target: Path) -> list[Path]:
     robot = load_robot(source)
     if target.resolve() == robot.folder:
         raise InputError(f"{target} is the robot itself; give the folder of its image another name.")
+    if not NAME.fullmatch(target.name):
+        raise InputError(f"{target} has a name that no robot may have; use letters, digits, spaces and _ . + -")
     written: dict[Path, bytes] = {}
     text = read_text(robot.urdf, "URDF")
     urdf = mirrored_urdf(text, target.name, robot.name)

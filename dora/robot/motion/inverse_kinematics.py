@@ -107,7 +107,7 @@ class InverseKinematics:
 
     def __init__(self, robot: RobotDescription, start: np.ndarray | None = None, seed: int = 0):
         self.chain = SerialChain.of(robot)
-        home = robot.postures["home"].arm if start is None else start
+        home = robot.posture("home").arm if start is None else start
         if len(home) != len(robot.arm):
             raise InputError(
                 f"the start posture has {len(home)} joints; the arm of {robot.name!r} has {len(robot.arm)}"
