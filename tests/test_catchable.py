@@ -72,5 +72,5 @@ def test_only_grasps_that_face_the_waiting_hand_can_be_used():
 
 
 def test_a_posture_that_the_robot_does_not_have_is_refused():
-    with pytest.raises(InputError, match="'diana7_hit' has no posture 'nowhere'; add it to .*zero, home"):
+    with pytest.raises(InputError, match=r"'diana7_hit' has no posture 'nowhere'; add it to .*zero, home"):
         with_waiting_hand(load_candidates("cube").select([0, 1]), load_robot("diana7_hit"), "nowhere")
