@@ -135,13 +135,15 @@ def write_safetensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping
     """Replace `path` by a safetensors file with a header and, in it, a digest of the whole file.
 
     Raises:
-        InputError: as `write_bytes`, or the header is larger than `MOST_HEADER`.
+        InputError: as `write_bytes`, or the file would be larger than `MOST_BYTES` or its header than `MOST_HEADER`.
     """
     own = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     content = save(own, {**header, WHOLE: ZEROS})
     size = 8 + int.from_bytes(content[:8], "little")
     if size > MOST_HEADER:
         raise InputError(f"{path} would have a header of {size} bytes; at most {MOST_HEADER} can be read again.")
+    if len(content) > MOST_BYTES:
+        raise InputError(f"{path} would have {len(content)} bytes; at most {MOST_BYTES} can be read again.")
     digest = hashlib.sha256(content).hexdigest()
     place = content.index(_entry(ZEROS), 0, size) + len(_entry(""))
     write_bytes(path, b"".join((content[:place], digest.encode(), content[place + len(ZEROS) :])))

@@ -62,6 +62,9 @@ def script() -> ModuleType:
         ("--eval-only --checkpoint /nowhere.safetensors", "no checkpoint"),
         ("--eval-only --zero-correction --env DoraCube-v1 --learner.gamma 0.5", "--learner.* has no effect"),
         ("--eval-only --zero-correction --env DoraCube-v1 --total-steps 5", "--total-steps has no effect"),
+        ("--eval-only --zero-correction --env DoraCube-v1 --num-envs 5", "--num-envs has no effect"),
+        ("--eval-only --zero-correction --env DoraCube-v1 --learner-threads 3", "--learner-threads has no effect"),
+        ("--eval-only --zero-correction --env DoraCube-v1 --collector ray", "--collector has no effect"),
         ("--env DoraCube-v1 --checkpoint missing", "--eval-only"),
     ],
 )

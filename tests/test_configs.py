@@ -91,12 +91,19 @@ def test_numbers_that_make_no_sense_are_refused(changes: dict, words: str):
     [
         ("ppo", "gamma", 2.0), ("sac", "gamma", float("nan")), ("ppo", "minibatch", 0), ("sac", "n_step", 0),
         ("sac", "polyak", -0.1), ("ppo", "learning_rate", 0.0), ("ppo", "noise_correlation", 1.0),
-        ("sac", "hidden", (256, 0)), ("ppo", "target_kl", float("inf")), ("ppo", "clip", 1.0), ("happo", "clip", 1.0),
+        ("sac", "hidden", (256, 0)), ("sac", "hidden", (4096, 4096)), ("ppo", "hidden", (4096, 4096, 4096)),
+        ("mappo", "hidden", (4096,) * 16), ("happo", "hidden", (2048,) * 9),
+        ("ppo", "target_kl", float("inf")), ("ppo", "clip", 1.0), ("happo", "clip", 1.0),
     ],
 )  # fmt: skip
 def test_settings_of_a_learner_that_make_no_sense_are_refused(agent: str, name: str, value: object):
     with pytest.raises(InputError, match=name.replace("_", ".")):
         recommended("DoraCube-v1", agent, learner={name: value})
+
+
+@pytest.mark.parametrize(("agent", "hidden"), [("sac", (2048, 2048)), ("ppo", (4096, 4096)), ("happo", (512,) * 16)])
+def test_networks_whose_checkpoints_can_be_read_are_not_refused(agent: str, hidden: tuple[int, ...]):
+    assert recommended("DoraCube-v1", agent, learner={"hidden": hidden}).learner.hidden == hidden
 
 
 def test_plain_data_make_the_same_configuration_again():

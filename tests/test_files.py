@@ -92,6 +92,16 @@ def test_a_failed_write_keeps_the_former_file(tmp_path: Path, monkeypatch: pytes
     assert [p.name for p in tmp_path.iterdir()] == ["kept"]
 
 
+@pytest.mark.parametrize("limit", ["MOST_BYTES", "MOST_HEADER"])
+def test_what_could_not_be_read_again_is_not_written(path: Path, limit: str, monkeypatch: pytest.MonkeyPatch):
+    before = path.read_bytes()
+    monkeypatch.setattr(f"dora.files.{limit}", 100)
+    with pytest.raises(InputError, match=r"file\.safetensors would have .* at most 100 can be read again"):
+        write_tensors(path, KIND, TENSORS, NOTE)
+    assert path.read_bytes() == before
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
 def test_a_file_can_be_read_by_others(tmp_path: Path):
     write_csv(tmp_path / "t.csv", ["a", "b"], [[1, 0.12345678], ["x", 2.0]])
     assert (tmp_path / "t.csv").read_text() == "a,b\n1,0.123457\nx,2\n"

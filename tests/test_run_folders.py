@@ -51,6 +51,22 @@ def test_a_missing_best_policy_is_told(tmp_path: Path):
         run(tmp_path / "run", SHORT, resume=True)
 
 
+@pytest.mark.parametrize("config", [SHORT, SHORT_SAC], ids=["ppo", "sac"])
+def test_networks_too_large_for_a_checkpoint_are_refused_before_training(
+    tmp_path: Path, config: Any, monkeypatch: pytest.MonkeyPatch
+):
+    """The size that is foreseen is that of what is written."""
+    run(tmp_path / "run", config)
+    size = sum(value.nbytes for name, value in weights(tmp_path / "run").items() if not name.startswith("rng/"))
+    monkeypatch.setattr("dora.agents.limits.MOST_HEADER", 0)
+    monkeypatch.setattr("dora.agents.limits.MOST_BYTES", int(0.95 * size))
+    with pytest.raises(InputError, match=r"--learner\.hidden makes checkpoints of .* give fewer or narrower layers"):
+        run(tmp_path / "larger", config)
+    assert not (tmp_path / "larger" / "progress.csv").exists()
+    monkeypatch.setattr("dora.agents.limits.MOST_BYTES", size)
+    run(tmp_path / "fits", config)
+
+
 def spoilt(path: Path, name: str) -> None:
     """Write a checkpoint again, with NaN in one of its tensors."""
     checkpoint = read_checkpoint(path)

@@ -159,6 +159,13 @@ def pack_modules(modules: dict[str, nn.Module]) -> dict[str, Tensor]:
     return {f"{key}/{n}": v for key, module in modules.items() for n, v in module.state_dict().items()}
 
 
+def bytes_of(modules: dict[str, nn.Module], optimisers: dict[str, torch.optim.Optimizer]) -> int:
+    """Size of a checkpoint of networks whose parameters have two moments each, as Adam keeps them [bytes]."""
+    stored = list(pack_modules(modules).values())
+    moments = [p for one in optimisers.values() for group in one.param_groups for p in group["params"]] * 2
+    return sum(tensor.numel() * tensor.element_size() for tensor in stored + moments)
+
+
 def check_finite(tensors: dict[str, Tensor], path: Path) -> None:
     """Refuse tensors of a checkpoint that are not finite.
 

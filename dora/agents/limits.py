@@ -1,14 +1,22 @@
 """Ranges of the settings of runs and learners, and the check that a run's are within them."""
 
-from dora.agents.config import RunConfig
+import itertools
+
+from dora.agents.config import RunConfig, SACConfig
 from dora.arguments import LARGEST_SEED
 from dora.configs import check_finite, check_ranges
 from dora.errors import InputError
+from dora.files import MOST_BYTES, MOST_HEADER
 
 MOST_TRANSITIONS = 100_000_000
 """Largest product of environments, workers and control steps of an iteration, and of a replay buffer [1]."""
 MOST_LAYERS, WIDEST = 16, 4096
 """Largest number of hidden layers, and of their units [1]."""
+COPIES, COPIES_OF_SAC = 6, 12
+"""Numbers in a checkpoint per weight of a network: actor and critic with two moments of Adam each; of SAC two critics,
+besides their targets and a second copy of the actor [1]."""
+BYTES = 4
+"""Size of such a number [bytes]."""
 RUN = {
     "seed": (0, LARGEST_SEED),
     "total_steps": (1, 10**12),
@@ -78,9 +86,27 @@ def check(config: RunConfig) -> None:
     hidden = config.learner.hidden
     if len(hidden) > MOST_LAYERS or not all(1 <= width <= WIDEST for width in hidden):
         raise InputError(f"--learner.hidden has to be at most {MOST_LAYERS} widths from 1 to {WIDEST}.")
+    weights = sum(a * b for a, b in itertools.pairwise(hidden))  # those of the first and last layer come on top
+    check_checkpoint(BYTES * weights * (COPIES_OF_SAC if isinstance(config.learner, SACConfig) else COPIES))
     at_once = config.num_envs * max(config.workers, 1) * config.learner.rollout
     if at_once > MOST_TRANSITIONS:
         raise InputError(
             f"--num-envs, --workers and --learner.rollout make {at_once} transitions at once, "
             f"which has to be at most {MOST_TRANSITIONS}: lower one of them."
+        )
+
+
+def check_checkpoint(size: int) -> None:
+    """Refuse networks whose checkpoints would be too large to be read again.
+
+    Args:
+        size: of the tensors of a checkpoint [bytes].
+
+    Raises:
+        InputError: there are too many weights.
+    """
+    if size > MOST_BYTES - MOST_HEADER:
+        raise InputError(
+            f"--learner.hidden makes checkpoints of {size / 1e6:.0f} MB, of which at most {MOST_BYTES / 1e6:.0f} MB "
+            "can be read again: give fewer or narrower layers."
         )

@@ -51,7 +51,7 @@ ENTRANCES = ("--env", "--eval-only", "--checkpoint", "--resume")
 """Options that say what is run."""
 OF_TRAINING = (
     "env", "agent", "learner", "total_steps", "eval_every", "eval_episodes", "stop_success", "checkpoint_seconds",
-    "normaliser_samples", "stagger", "after_success",
+    "normaliser_samples", "stagger", "after_success", "num_envs", "learner_threads",
 )  # fmt: skip
 """Settings that have no effect on the evaluation of a policy."""
 SHOWN = "DoraHammer-v1"
@@ -123,6 +123,8 @@ def parse(words: Sequence[str]) -> Args[dict[str, Any], Any, str]:
     if not args.eval_only:
         return replace(args, run=config)
     refuse_settings_of_training(base, config)
+    if args.collector != default.collector:
+        raise InputError("--collector has no effect on an evaluation: leave it out.")
     if args.zero_correction and not config.has_prior:
         raise InputError("--zero-correction needs guidance with a prior: without one there is nothing to correct.")
     episode = FINAL_SEED if first.seed is None else first_seed(config.seed, config.final_episodes)

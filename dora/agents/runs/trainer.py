@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dora.agents.checkpoint import (
     Checkpoint,
+    bytes_of,
     check_belongs,
     check_finite,
     pack_modules,
@@ -33,6 +34,7 @@ from dora.agents.evaluation.evaluate import PERIODIC_SEED, Evaluation, outcome
 from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.finite import check_modules, check_tensors
 from dora.agents.learners.learner import Learner, agents_of, make_learner
+from dora.agents.limits import check_checkpoint
 from dora.agents.runs.interrupt import Interrupt
 from dora.agents.runs.logging import RunLog
 from dora.agents.runs.machine import OtherLoad
@@ -66,7 +68,7 @@ class Trainer:
         cluster: workers are actors of a Ray cluster instead of processes of this machine.
 
     Raises:
-        InputError: if the checkpoint does not fit.
+        InputError: if the checkpoint does not fit, or the networks are too large for one.
     """
 
     def __init__(
@@ -91,6 +93,7 @@ class Trainer:
         torch.manual_seed(weights_seed)
         self.agents = agents_of(config, self._evaluators.agents)
         self.learner: Learner = make_learner(config, *self.sizes, self.agents)
+        check_checkpoint(bytes_of(self.learner.modules, self.learner.optimisers))
         torch.manual_seed(self._exploration_seed)
         self._recent = torch.zeros(0, len(self.columns.names))
         self._resumed: dict[str, Tensor] | None = None
