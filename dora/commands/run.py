@@ -143,6 +143,7 @@ def settings_to_start_from(first: First, words: Sequence[str]) -> RunConfig:
         for option, value in given.items():
             if value is not None:
                 raise InputError(f"{option} does not go with --resume, which goes on in its folder: leave it out.")
+        RunFolder(first.resume).check_trained()
         return RunFolder(first.resume).read_config()
     preset = first.preset
     if preset is not None:
@@ -238,9 +239,9 @@ def train(args: Args) -> tuple[Path, int]:
     else:
         folder.create(config)
     with folder.locked():
-        folder.write_config(config)
         options: Any = {"zero": args.zero_correction, "cluster": args.collector == "ray"}
         trainer = Trainer(config, task_maker(config), folder, resume=args.resume is not None, **options)
+        folder.write_config(config)  # a larger budget, once it is known that the run can go on
         go_on = "To go on: " + shlex.join([*started_as(sys.orig_argv, sys.argv), "--resume", str(folder.path)])
         try:
             trainer.run()
@@ -279,7 +280,7 @@ def evaluate_only(args: Args) -> Path:
     progress: dict[str, Any] = {"env_steps": 0, "wall_seconds": 0.0, "episodes": 0, "curve": []}
 
     def begin() -> None:
-        folder.create(config)
+        folder.create(config, evaluation=True)
         if args.video:
             film(path, config, folder.video / ("best.mp4" if path else "zero.mp4"), args.first_seed)
         print(f"evaluation on {config.final_episodes} episodes ...", file=sys.stderr)

@@ -25,8 +25,10 @@ from dora.version import VERSION, source_commit
 
 PACKAGES = ("mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 """Packages whose versions are written besides that of Dora."""
-OWN_FILES = ("config.yaml", "result.json", "curve.csv", "eval.csv", "progress.csv", "checkpoints/latest.safetensors",
-             "checkpoints/best.safetensors")  # fmt: skip
+EVALUATION = "evaluation.txt"
+"""File of a folder in which a policy is only evaluated."""
+OWN_FILES = (EVALUATION, "config.yaml", "result.json", "curve.csv", "eval.csv", "progress.csv",
+             "checkpoints/latest.safetensors", "checkpoints/best.safetensors")  # fmt: skip
 """Files by which a folder is known to hold a run."""
 CURVE_HEADER = (
     "env_steps",
@@ -48,7 +50,8 @@ class RunFolder:
     `config.yaml`, `versions.txt`, TensorBoard events, `checkpoints/{latest,best}.safetensors`,
     `checkpoints/replay/` (SAC), `progress.csv` (one row per iteration), `curve.csv` (one row per evaluation),
     `eval.csv` (one row per episode of the last evaluation), `zero.csv` (the same of zero correction), `result.json`,
-    `video/`, `nonfinite/` (last states of simulations that were not finite), `.lock`.
+    `video/`, `nonfinite/` (last states of simulations that were not finite), `.lock`; `evaluation.txt` where nothing is
+    trained.
     """
 
     path: Path
@@ -114,6 +117,8 @@ class RunFolder:
             fits = above.is_dir() and os.access(above, os.W_OK | os.X_OK)
         except (OSError, ValueError) as error:
             raise InputError(f"Cannot make the run folder {self.path} ({error}): choose another --out.") from error
+        if found and self.is_evaluation():
+            raise InputError(f"{self.path} holds an evaluation already ({found[0]}): choose another --out.")
         if found:
             raise InputError(
                 f"{self.path} holds a run already ({found[0]}): continue it with --resume or choose another --out."
@@ -121,8 +126,27 @@ class RunFolder:
         if not fits:
             raise InputError(f"Cannot make the run folder {self.path} (nothing can be written): choose another --out.")
 
-    def create(self, config: RunConfig) -> None:
-        """Make the folder and write `config.yaml` and `versions.txt`.
+    def is_evaluation(self) -> bool:
+        """Whether a policy was only evaluated here; the results of earlier versions tell it by the policy they name."""
+        if os.path.lexists(self.path / EVALUATION):
+            return True
+        result = self._stored_result()
+        return isinstance(result, dict) and "checkpoint" in result
+
+    def check_trained(self) -> None:
+        """Refuse to go on with what was never trained here.
+
+        Raises:
+            InputError: the folder is one of `--eval-only`.
+        """
+        if self.is_evaluation():
+            raise InputError(
+                f"{self.path} holds an evaluation, in which nothing is trained: give --resume the folder of a run, "
+                "or evaluate again by --eval-only."
+            )
+
+    def create(self, config: RunConfig, evaluation: bool = False) -> None:
+        """Make the folder and write `config.yaml` and `versions.txt`, and before them what tells an evaluation.
 
         Raises:
             InputError: if it cannot be written or holds a run already.
@@ -134,6 +158,8 @@ class RunFolder:
             raise InputError(
                 f"Cannot make the run folder {self.path} ({error.strerror}): choose another --out."
             ) from error
+        if evaluation:
+            write_bytes(self.path / EVALUATION, b"A policy is evaluated here, nothing is trained.\n")
         self.write_config(config)
         write_bytes(self.path / "versions.txt", _versions().encode())
 
@@ -167,13 +193,16 @@ class RunFolder:
 
     def mark_unfinished(self) -> None:
         """Let an earlier `result.json` say that the run is not finished, because it goes on."""
-        path = self.path / "result.json"
-        try:
-            result = read_json(path, "result", MOST_RESULT)
-        except InputError:
-            return
+        result = self._stored_result()
         if isinstance(result, dict) and result.get("finished"):
             self.write_result(result | {"finished": False})
+
+    def _stored_result(self) -> Any:
+        """What `result.json` holds; None where it cannot be read."""
+        try:
+            return read_json(self.path / "result.json", "result", MOST_RESULT)
+        except InputError:
+            return None
 
     def write_config(self, config: RunConfig) -> None:
         """Write `config.yaml`."""
