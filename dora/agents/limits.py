@@ -70,6 +70,8 @@ LEARNER = {
     "log_std_max": LOGARITHM,
 }
 """Lowest and highest value of the settings of learners."""
+ORDERED = (("learning_rate_min", "learning_rate_max"), ("log_std_min", "log_std"))
+"""Settings of learners of which the first may not be larger than the second."""
 FLAGS = {"final_episodes": "episodes"}
 """Options whose name is not that of their setting."""
 
@@ -83,6 +85,11 @@ def check(config: RunConfig) -> None:
     check_ranges(config, RUN, lambda name: f"--{FLAGS.get(name, name).replace('_', '-')}")
     check_finite(config.learner, "learner")
     check_ranges(config.learner, LEARNER, lambda name: f"--learner.{name.replace('_', '-')}")
+    for low, high in ORDERED:
+        least, most = getattr(config.learner, low, None), getattr(config.learner, high, None)
+        if least is not None and most is not None and least > most:
+            names = f"--learner.{low.replace('_', '-')} is {least} and --learner.{high.replace('_', '-')} {most}"
+            raise InputError(f"{names}: the first has to be the smaller one.")
     hidden = config.learner.hidden
     if len(hidden) > MOST_LAYERS or not all(1 <= width <= WIDEST for width in hidden):
         raise InputError(f"--learner.hidden has to be at most {MOST_LAYERS} widths from 1 to {WIDEST}.")
@@ -93,6 +100,10 @@ def check(config: RunConfig) -> None:
         raise InputError(
             f"--num-envs, --workers and --learner.rollout make {at_once} transitions at once, "
             f"which has to be at most {MOST_TRANSITIONS}: lower one of them."
+        )
+    if (capacity := getattr(config.learner, "capacity", at_once)) < at_once:
+        raise InputError(
+            f"--learner.capacity is {capacity}, and an iteration collects {at_once} transitions: give at least as many."
         )
 
 
