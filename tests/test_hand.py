@@ -1,14 +1,18 @@
 """The batched hand model against pytorch_kinematics, finite differences and its own geometry."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 import pytorch_kinematics
 import torch
+from refusals import refused
 
 from dora.affordance.hand.capsules import Capsule, capsules_of, farthest_points
 from dora.affordance.hand.hand_model import PALM, HandModel
 from dora.geometry.rotations import matrix_from_rotation_vector
-from dora.robot import Shape
+from dora.robot import RobotDescription, Shape
 
 POSITION_TOLERANCE = 1e-5
 """Largest accepted difference of two libraries' frames (m, and unitless for rotation entries)."""
@@ -154,3 +158,69 @@ def test_capsule_without_length_is_a_sphere():
     capsule = Capsule(0, "link", np.zeros(3), np.zeros(3), 0.01)
     assert capsule.spheres().shape == (1, 3)
     np.testing.assert_allclose(capsule.distance(np.array([[0.03, 0.0, 0.0]])), 0.02)
+
+
+def with_shape(robot: RobotDescription, link: str, *shapes: Any) -> Any:
+    """The robot with other shapes on a link, or without them."""
+    made = tuple(Shape(kind, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), size) for kind, size in shapes)
+    return replace(robot, shapes=robot.shapes | {link: made})
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        (("box", (0.5, 0.5, 5e-10)), "is 1e-09 m thin, so that it needs [0-9]+ capsules"),
+        (("box", (0.05, 0.05, 1e-4)), "is 0.0002 m thin, so that it needs 500 capsules"),
+        (("cylinder", (0.0765, 5e7)), "become more than 300 capsules or 1 m.2"),
+        (("cylinder", (5.0, 5.0)), "become more than 300 capsules or 1 m.2"),
+        (("sphere", (1e6,)), "become more than 300 capsules or 1 m.2"),
+        (("cylinder", (1e-6, 5.0)), "more than 20000 spheres"),
+    ],
+)
+def test_shapes_that_need_too_much_are_refused(robot: RobotDescription, shape: Any, words: str):
+    with refused(words):
+        HandModel(with_shape(robot, robot.palm_link, shape))
+
+
+def test_many_thin_shapes_are_refused(robot: RobotDescription):
+    with refused("up to 'base_link_hithand' become more than 300 capsules"):
+        HandModel(with_shape(robot, robot.palm_link, *[("box", (0.02, 0.02, 2e-4))] * 4))
+
+
+@pytest.mark.parametrize("radius", [1e-9, 1e-4, 3e-4, 5e-4])
+def test_thin_capsules_have_spheres_that_touch(radius: float):
+    capsule = Capsule(0, "a", np.zeros(3), np.array([20.5 * radius, 0.0, 0.0]), radius)
+    assert np.diff(capsule.spheres()[:, 0]).max() <= 2 * radius
+    assert len(capsule.spheres()) == capsule.sphere_count() <= 13
+    assert len(Capsule(0, "a", np.zeros(3), np.zeros(3), radius).spheres()) == 1
+
+
+def test_a_hand_of_thin_shapes_is_modelled(robot: RobotDescription):
+    link = robot.fingers["thumb"].distal
+    for shape in (("sphere", (1e-4,)), ("cylinder", (1e-4, 1e-3)), ("box", (1e-3, 1e-3, 1e-4))):
+        assert HandModel(with_shape(robot, link, shape)).palm_frame.normal.shape == (3,)
+
+
+def test_a_hand_without_shapes_is_refused(robot: RobotDescription):
+    with refused("the finger 'thumb' of 'diana7_hit' has no collision shape"):
+        HandModel(replace(robot, shapes={}))
+    thumb = robot.fingers["thumb"]
+    with refused("the finger 'thumb' of 'diana7_hit' has no collision shape"):
+        HandModel(replace(robot, shapes={k: v for k, v in robot.shapes.items() if k not in thumb.links}))
+    bare = HandModel(replace(robot, shapes={k: v for k, v in robot.shapes.items() if k != robot.palm_link}))
+    assert np.isfinite(bare.palm_frame.center).all()
+    assert PALM not in bare.contact_part
+
+
+def test_a_palm_that_faces_nowhere_is_refused(robot: RobotDescription):
+    joints = {name: replace(joint, lower=-1.0, upper=1.0) for name, joint in robot.model.joints.items()}
+    with refused("the palm of 'diana7_hit' faces nowhere"):
+        HandModel(replace(robot, model=replace(robot.model, joints=robot.model.joints | joints)))
+
+
+def test_a_tip_on_the_last_joint_is_refused(robot: RobotDescription):
+    joints = dict(robot.model.joints)
+    (name,) = [name for name, joint in joints.items() if joint.child == "thumb_tip"]
+    joints[name] = replace(joints[name], origin=np.eye(4))
+    with refused("the tip 'thumb_tip' lies on the last joint"):
+        HandModel(replace(robot, model=replace(robot.model, joints=joints)))

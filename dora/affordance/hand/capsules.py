@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import trimesh
 
+from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_quaternion
 from dora.robot import Shape
 
@@ -24,6 +25,11 @@ SAMPLE_DENSITY = 1e6
 """Density of surface samples from which contact points are chosen [1/m^2]."""
 BURIED = -2e-4
 """Signed distance to another shape of the straight hand below which a surface sample is no contact point [m]."""
+
+THIN = 1e-3
+"""Radius below which a capsule is enlarged to sample its surface [m]."""
+MOST_CAPSULES = 300
+"""Largest number of capsules of a hand, and of one box [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +44,22 @@ class Capsule:
 
     def spheres(self, sagitta: float = SAGITTA) -> np.ndarray:
         """Centres (n, 3) of spheres on the axis whose union is at most `sagitta` [m] thinner than the capsule [m]."""
-        length = float(np.linalg.norm(self.end - self.start))
-        spacing = 2 * math.sqrt(sagitta * (2 * self.radius - sagitta))
-        count = math.ceil(length / spacing) + 1 if length > 0 else 1
-        return np.linspace(self.start, self.end, count)
+        return np.linspace(self.start, self.end, self.sphere_count(sagitta))
+
+    def sphere_count(self, sagitta: float = SAGITTA) -> int:
+        """Number of those spheres; neighbours touch at least, however thin the capsule is."""
+        depth = min(sagitta, self.radius)
+        return math.ceil(self.length / (2 * math.sqrt(depth * (2 * self.radius - depth)))) + 1 if self.length > 0 else 1
+
+    @property
+    def length(self) -> float:
+        """Length of the axis [m]."""
+        return float(np.linalg.norm(self.end - self.start))
+
+    @property
+    def area(self) -> float:
+        """Area of the surface [m^2]."""
+        return 2 * math.pi * self.radius * (2 * self.radius + self.length)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distance (n,) of points (n, 3) to the surface, negative inside [m]."""
@@ -59,6 +77,9 @@ def capsules_of(shape: Shape, body: int, link: str, pose: np.ndarray) -> list[Ca
 
     Exact for capsules and spheres. A cylinder becomes the longest capsule inside it; a box becomes a row of capsules
     along its longest side, with its smallest half side as radius. Only the edges are lost.
+
+    Raises:
+        InputError: a thin box would become more than `MOST_CAPSULES`.
     """
     turn = pose[:3, :3] @ matrix_from_quaternion(torch.tensor(shape.quaternion, dtype=torch.float64)).numpy()
     center = pose[:3, :3] @ np.asarray(shape.position) + pose[:3, 3]
@@ -76,6 +97,11 @@ def _box(half: np.ndarray, center: np.ndarray, turn: np.ndarray, body: int, link
     thin, middle, long = np.argsort(half)
     radius = float(half[thin])
     count = math.ceil((half[middle] - radius) / radius) + 1
+    if count > MOST_CAPSULES:
+        raise InputError(
+            f"a collision box of the link {link!r} is {2 * radius:g} m thin, so that it needs {count} capsules, and "
+            f"{MOST_CAPSULES} are allowed: make it thicker or narrower in the URDF."
+        )
     reach = turn[:, long] * (half[long] - radius)
     rows = np.linspace(-1.0, 1.0, count) if count > 1 else np.zeros(1)
     offsets = [row * (half[middle] - radius) * turn[:, middle] for row in rows]
@@ -113,15 +139,15 @@ def palmar_points(
 
 def _surface(capsule: Capsule) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3) [m] and normals (n, 3) on the surface of a capsule, sampled with a fixed seed."""
-    axis = capsule.end - capsule.start
-    length = float(np.linalg.norm(axis))
-    mesh = trimesh.creation.capsule(height=length, radius=capsule.radius, count=[16, 16])
+    axis, length = capsule.end - capsule.start, capsule.length
+    scale = 1.0 if capsule.radius > THIN else THIN / capsule.radius  # trimesh takes tiny triangles for none
+    mesh = trimesh.creation.capsule(height=scale * length, radius=scale * capsule.radius, count=[16, 16])
     turn = trimesh.geometry.align_vectors([0, 0, 1], axis / length) if length > 0 else np.eye(4)
     pose = np.array(turn, dtype=float)
-    pose[:3, 3] = 0.5 * (capsule.start + capsule.end)
+    pose[:3, 3] = 0.5 * (capsule.start + capsule.end) * scale
     mesh.apply_transform(pose)
-    count = max(64, int(mesh.area * SAMPLE_DENSITY))
-    points, _ = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
+    count = max(64, int(mesh.area / scale**2 * SAMPLE_DENSITY))
+    points = trimesh.sample.sample_surface(mesh, count, seed=0)[0] / scale
     center = capsule.nearest(points)
     normals = (points - center) / np.linalg.norm(points - center, axis=1, keepdims=True)
     return center + capsule.radius * normals, normals
@@ -129,6 +155,8 @@ def _surface(capsule: Capsule) -> tuple[np.ndarray, np.ndarray]:
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
     """Indices (min(count, n),) of points (n, 3) by farthest-point sampling, which starts at index 0."""
+    if not len(points):
+        return np.zeros(0, dtype=int)
     chosen = [0]
     distance = np.linalg.norm(points - points[0], axis=1)
     while len(chosen) < min(count, len(points)):

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dora.affordance.hand.capsules import BURIED, Capsule, capsules_of, palmar_points
+from dora.affordance.hand.capsules import BURIED, MOST_CAPSULES, Capsule, capsules_of, palmar_points
 from dora.errors import InputError
 from dora.robot import RobotDescription
 from dora.robot.kinematics import rodrigues
@@ -27,6 +27,10 @@ POINTS_PER_LINK = 24
 """Number of contact points on each finger link."""
 POINTS_ON_PALM = 40
 """Number of contact points on the palm."""
+LEAST = 1e-6
+"""Length of a link [m], or of a mean direction [1], below which it has no direction."""
+MOST_SPHERES, MOST_AREA = 20_000, 1.0
+"""Largest number of spheres on the capsules of a hand, and area of their surfaces together [m^2]."""
 
 
 class Points:
@@ -87,7 +91,8 @@ class HandModel:
         palm_frame: axes and centre of the palm in the wrist frame.
 
     Raises:
-        InputError: the robot has no finger, or a finger has a joint that is not revolute.
+        InputError: the robot has no finger, a finger has a joint that is not revolute or no collision shape, the shapes
+            are too many or too large, or the palm faces nowhere.
     """
 
     def __init__(
@@ -162,12 +167,21 @@ class HandModel:
         """(bodies, joints) 1 where the joint moves the body, else 0."""
 
     def _build_shapes(self) -> None:
-        capsules = [
-            capsule
-            for link, (body, pose) in _places(self.robot, self.links).items()
-            for shape in self.robot.shapes.get(link, ())
-            for capsule in capsules_of(shape, body, link, pose)
-        ]
+        capsules: list[Capsule] = []
+        for link, (body, pose) in _places(self.robot, self.links).items():
+            for shape in self.robot.shapes.get(link, ()):
+                capsules += capsules_of(shape, body, link, pose)
+                if len(capsules) > MOST_CAPSULES or sum(capsule.area for capsule in capsules) > MOST_AREA:
+                    raise InputError(
+                        f"the collision shapes of the hand of {self.robot.name!r} up to {link!r} become more than "
+                        f"{MOST_CAPSULES} capsules or {MOST_AREA:g} m^2: make them fewer, thicker or smaller."
+                    )
+        covered = {(capsule.body - 1) // self.depth for capsule in capsules}
+        for index, name in enumerate(self.robot.fingers):
+            if index not in covered:
+                raise InputError(
+                    f"the finger {name!r} of {self.robot.name!r} has no collision shape; add one to its URDF."
+                )
         self.capsules: tuple[Capsule, ...] = tuple(sorted(capsules, key=lambda capsule: capsule.body))
         ends = np.concatenate([(c.start, c.end) for c in self.capsules])
         self.ends = self._points([c.body for c in self.capsules for _ in range(2)], ends)
@@ -177,6 +191,11 @@ class HandModel:
 
     def sphere_set(self, **density: float) -> tuple[Points, Float[Tensor, " s"]]:
         """Spheres that cover the capsules, and their radii (s,) [m]; `density` as for `Capsule.spheres`."""
+        if sum(capsule.sphere_count(**density) for capsule in self.capsules) > MOST_SPHERES:
+            raise InputError(
+                f"the collision shapes of the hand of {self.robot.name!r} need more than {MOST_SPHERES} spheres: make "
+                "them fewer, thicker or shorter."
+            )
         centers = [capsule.spheres(**density) for capsule in self.capsules]
         counts = [len(points) for points in centers]
         body = np.repeat([capsule.body for capsule in self.capsules], counts)
@@ -191,11 +210,9 @@ class HandModel:
         palmar, along = _directions(self.robot, chains, poses, self.depth)
         first = min(1, self.fingers - 1)
         bases = poses[1 :: self.depth, :3, 3]
-        normal = palmar[first:, 0].mean(0)
-        normal /= np.linalg.norm(normal)
+        normal = self._unit(palmar[first:, 0].mean(0))
         finger = along[first:, 0].mean(0)
-        finger -= normal * (finger @ normal)
-        finger /= np.linalg.norm(finger)
+        finger = self._unit(finger - normal * (finger @ normal))
         bodies, points, normals = [], [], []
         for body in range(len(self.links)):
             shapes = [capsule for capsule in self.capsules if capsule.body == body]
@@ -208,9 +225,13 @@ class HandModel:
             found = palmar_points(shapes, facing, POINTS_PER_LINK if body else POINTS_ON_PALM, tip)
             free = _outside_others(self.capsules, poses, body, found[0])
             found = found[0][free], found[1][free]
+            if not free.any():
+                continue
             bodies.append(np.full(len(found[0]), body))
             points.append(found[0])
             normals.append(found[1])
+        if not points:
+            raise InputError(f"the hand of {self.robot.name!r} has no collision shape that faces its palmar side.")
         self.contacts = self._points(np.concatenate(bodies), np.concatenate(points))
         self.contact_normal = self._tensor(np.concatenate(normals))
         self.contact_part = self.part[self.contacts.body]
@@ -218,6 +239,16 @@ class HandModel:
         center = bases[first:].mean(0)
         center += normal * (surface - center @ normal)
         self.palm_frame = PalmFrame(normal, finger, np.cross(finger, normal), center)
+
+    def _unit(self, direction: np.ndarray) -> np.ndarray:
+        """A direction (3,) of the palm with norm 1."""
+        norm = float(np.linalg.norm(direction))
+        if norm < LEAST:
+            raise InputError(
+                f"the palm of {self.robot.name!r} faces nowhere: the first joint of each finger has to turn further to "
+                "one side, which is the palmar one, or to lie at the place of one that does."
+            )
+        return direction / norm
 
     def forward(self, wrist: Float[Tensor, "c 4 4"], actuated: Float[Tensor, "c a"]) -> Float[Tensor, "c b 4 4"]:
         """Forward kinematics: poses of all bodies in the frame of `wrist` [m] at the actuated joints [rad]."""
@@ -329,7 +360,11 @@ def _directions(
         for level in reversed(range(len(moving))):
             joint, start = moving[level], origins[level]
             line = ends[level][:3, 3] - start[:3, 3]
-            if np.linalg.norm(line) < 1e-6:
+            if np.linalg.norm(line) < LEAST:
+                if level + 1 == len(moving):
+                    raise InputError(
+                        f"the tip {chain[-1].child!r} lies on the last joint of its finger; move its frame."
+                    )
                 palmar[finger, level], along[finger, level] = palmar[finger, level + 1], along[finger, level + 1]
                 continue
             close = np.cross(start[:3, :3] @ joint.axis * np.sign(joint.upper + joint.lower), line)
