@@ -39,7 +39,7 @@ from dora.agents.runs.run_folder import RunFolder
 from dora.live.recordings import Recording
 from dora.policies.card import Card
 from dora.policies.policy import bundled_files
-from dora.robot import loading, mirror
+from dora.robot import loading, mirror, visuals
 from dora.robot.build import write_urdf
 
 ROOT = Path(__file__).parents[1]
@@ -200,6 +200,16 @@ def write_parameters(folder: Path) -> None:
     shutil.copy(ROBOT / "parameters.yaml", folder)
 
 
+def write_visuals(folder: Path) -> None:
+    """A table of meshes with a part of each kind."""
+    table = yaml.safe_load((ROBOT / "visuals.yaml").read_text())
+    kinds: dict[str, Any] = {}
+    for part in (part for parts in table["meshes"].values() for part in parts):
+        kinds.setdefault(part["part"], part)
+    chosen = {"materials": table["materials"], "meshes": {"one": list(kinds.values())}}
+    (folder / "visuals.yaml").write_text(yaml.safe_dump(chosen))
+
+
 def write_object(folder: Path) -> None:
     write_object_folder(two_regions(), folder / "box")
 
@@ -303,6 +313,7 @@ LOADERS: dict[str, Loader] = {
     "robot.toml": Loader(write_robot, load_robot, ("robot.toml",)),
     "robot.urdf": Loader(write_robot, load_robot, ("robot.urdf",)),
     "parameters.yaml": Loader(write_parameters, write_urdf, ("parameters.yaml",)),
+    "visuals.yaml": Loader(write_visuals, visuals.write_meshes, ("visuals.yaml",)),
     "object.toml": Loader(write_object, load_object, ("object.toml",)),
     "articulation.toml": Loader(write_mounted, load_mounted, ("articulation.toml",)),
     "object meshes": Loader(write_object, load_object, ("*.ply",)),

@@ -4,11 +4,13 @@ import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 from refusals import refused
 
 from dora.robot import RobotDescription, load_robot
 from dora.robot.mirror import write_mirrored
 from dora.robot.motion.inverse_kinematics import InverseKinematics
+from dora.robot.visuals import write_meshes
 
 TOML, URDF = "robot.toml", "robot.urdf"
 THUMB = '["Right_Thumb_0", "Right_Thumb_1", "Right_Thumb_2", "Right_Thumb_3"]'
@@ -131,3 +133,15 @@ def test_an_image_has_a_name_that_can_be_read(robot: RobotDescription, tmp_path:
     with refused("has a name that no robot may have"):
         write_mirrored(robot.folder, tmp_path / name)
     assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize("name", ["../../esc", "/nowhere/esc", "a/b", "..", "", "a\\b", "x" * 300, 7, "a\0b"])
+def test_meshes_have_names_of_files_in_their_folder(robot: RobotDescription, tmp_path: Path, name: object):
+    table = yaml.safe_load((robot.folder / "visuals.yaml").read_text())
+    ball = {"part": "hull", "material": "m", "of": [{"at": [0, 0, 0], "radius": 0.01}]}
+    table = {"materials": {"m": next(iter(table["materials"].values()))}, "meshes": {"good": [ball], name: [ball]}}
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "robot" / "visuals.yaml").write_text(yaml.safe_dump(table))
+    with refused("visuals.yaml names a mesh .*; use letters"):
+        write_meshes(tmp_path / "robot")
+    assert [path.name for path in tmp_path.rglob("*")] == ["robot", "visuals.yaml"]

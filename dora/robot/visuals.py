@@ -7,6 +7,7 @@ a spline, and convex hulls of spheres and rounded discs. Parts of one material b
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -19,12 +20,14 @@ from scipy.interpolate import CubicSpline
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from dora.errors import InputError, command
+from dora.errors import InputError, command, shown
 from dora.files import make_folder, write_bytes
 from dora.reading import read_yaml
 
 Row = Mapping[str, Any]
 """One row of the table."""
+MESH_NAME = re.compile(r"\w[\w.-]{0,199}")
+"""Names of meshes: plain, so that their files lie in the folder `meshes` itself."""
 AROUND = 40
 """Number of points around a circle."""
 ALONG = 16
@@ -52,7 +55,7 @@ def write_meshes(folder: Path) -> list[Path]:
     """Write `folder`/meshes/*.glb from `folder`/visuals.yaml and return their paths.
 
     Raises:
-        InputError: as `build_meshes`.
+        InputError: as `build_meshes`, or a mesh has a name that is no plain one for a file; nothing is written then.
     """
     table = folder / "visuals.yaml"
     content = read_yaml(table, "table of visual meshes")
@@ -62,6 +65,9 @@ def write_meshes(folder: Path) -> list[Path]:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{table} has a value that makes no mesh ({error}): correct it.") from error
+    for name in scenes:
+        if not isinstance(name, str) or not MESH_NAME.fullmatch(name):
+            raise InputError(f"{table} names a mesh {shown(name)}; use letters, digits and _ . - after the first.")
     target = folder / "meshes"
     make_folder(target)
     paths = []
