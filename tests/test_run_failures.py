@@ -276,9 +276,9 @@ def test_a_second_signal_while_the_result_is_written_changes_nothing(tmp_path: P
     trainer, close = Trainer(SHORT, PointMass, folder), Evaluators.close
     update = trainer.learner.update
 
-    def interrupted(batch: Any) -> Any:
+    def interrupted(*batch: Any) -> Any:
         os.kill(os.getpid(), signal.SIGTERM)
-        return update(batch)
+        return update(*batch)
 
     def closing(self: Evaluators) -> None:
         time.sleep(IMPATIENT + 0.1)
@@ -300,8 +300,8 @@ def test_what_is_half_learned_is_not_saved(tmp_path: Path, monkeypatch: pytest.M
     trainer.save()
     update, calls = trainer.learner.update, []
 
-    def half(batch: Any) -> Any:
-        calls.append(update(batch))
+    def half(*batch: Any) -> Any:
+        calls.append(update(*batch))
         if len(calls) == 3:
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(IMPATIENT + 0.1)

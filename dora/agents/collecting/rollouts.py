@@ -38,6 +38,16 @@ LESS_URGENT = 5
 """Niceness of workers that collect while the learner is busy: the learner has priority."""
 
 
+class OwnTaskEnv(TaskEnv):
+    """`TaskEnv` of the main process: calls `check` before every control step, which may raise."""
+
+    check: Callable[[], None] = staticmethod(lambda: None)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.check()
+        return super()._step(tensordict)
+
+
 class WorkerTaskEnv(TaskEnv):
     """`TaskEnv` of a worker process: leaves the message of an exception in a file for the main process.
 
@@ -133,7 +143,7 @@ class Rollouts:
         cluster: bool = False,
     ):
         self._policy = policy
-        self._waits, self._cluster = workers > 0, cluster and workers > 0
+        self._cluster = cluster and workers > 0
         self._acting = copy.deepcopy(policy) if workers > 0 else policy  # the workers share its memory
         self._ahead = ahead
         self._next: Future[TensorDictBase] | None = None
@@ -141,13 +151,14 @@ class Rollouts:
         self._scratch = tempfile.TemporaryDirectory(prefix=name_of_process())
         self._reports = [Path(self._scratch.name) / str(i) for i in range(max(workers, 1))]
         self._processes: Sequence[Any] = ()
+        self._own: OwnTaskEnv | None = None
         if self._cluster:
             frames = workers * num_envs * rollout
             self._collector: Any = ray_collector(make_task, self._acting, frames=frames, seeds=seeds, ends=ends)
         elif workers == 0:
-            env = TaskEnv(make_task(), seed=seeds[0], ends=ends)
+            self._own = OwnTaskEnv(make_task(), seed=seeds[0], ends=ends)
             self._collector = Collector(
-                env,
+                self._own,
                 policy,
                 frames_per_batch=num_envs * rollout,
                 total_frames=-1,
@@ -205,13 +216,15 @@ class Rollouts:
         """The next batch; its memory is reused by the following call.
 
         Args:
-            check: called now and then while workers collect; may raise.
+            check: called now and then while workers collect, and without them before every control step; may raise, and
+                without workers nothing more can be collected then.
 
         Raises:
             InputError: with the message of a worker that raised one.
             WorkerFailure: if a worker failed otherwise, died, or hangs.
         """
-        if not self._waits:
+        if self._own is not None:
+            self._own.check = check
             return next(self._iterator)
         with self._explained():
             future = self._next or self._begin()

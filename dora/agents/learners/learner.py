@@ -13,6 +13,7 @@ from dora.agents.learners.networks import Policy
 from dora.agents.learners.ppo import PPO
 from dora.agents.learners.replay import Replay
 from dora.agents.learners.sac import SAC
+from dora.agents.learners.stopping import Stop, never
 
 
 @runtime_checkable
@@ -37,8 +38,12 @@ class Learner(Protocol):
         """Optimisers."""
         ...
 
-    def update(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from a batch (N, T) of fresh transitions; losses and other values by name."""
+    def update(self, batch: TensorDictBase, stop: Stop = never) -> dict[str, float]:
+        """Learn from a batch (N, T) of fresh transitions; losses and other values by name.
+
+        `stop` is asked before every gradient step: once it says yes, no further one is taken. The batch counts as
+        learned from, and what a checkpoint would hold is whole.
+        """
         ...
 
     def counters(self) -> dict[str, float]:

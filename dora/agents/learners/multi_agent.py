@@ -26,6 +26,7 @@ from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, GaussianActor, JointActor, LatestOutput, Normaliser, Policy, for_loss
 from dora.agents.learners.ppo import ADAM_EPSILON, adapted, excess, squared, standardised, transitions
 from dora.agents.learners.pull import pull
+from dora.agents.learners.stopping import Stop, never
 
 Passes = Sequence[Int[Tensor, " b"]]
 """The order of the transitions in each pass over a batch; the same for all agents and the critic."""
@@ -80,8 +81,9 @@ class MultiAgentPPO:
         """Restore `counters`."""
         self.steps = counters.get("steps", 0.0)  # earlier versions did not count
 
-    def update(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from a batch (N, T) and return the means of the losses by name, those of an agent as `<name>/<agent>`.
+    def update(self, batch: TensorDictBase, stop: Stop = never) -> dict[str, float]:
+        """Learn from a batch (N, T) and return the means of the losses by name, those of an agent as `<name>/<agent>`;
+        nothing if `stop` said yes.
 
         The very first batch only sets the normaliser, as in PPO.
         """
@@ -97,11 +99,13 @@ class MultiAgentPPO:
         count = len(self.agents)
         order = torch.randperm(count).tolist() if self.in_turn and count > 1 else range(count)
         updates, parts = list(self.updates.values()), self._parts(data)
-        found = learn_in_order(updates, parts, advantage, order, passes, compound=self.in_turn)
-        values = {f"{n}/{agent}": v for agent, own in zip(self.agents, found, strict=True) for n, v in own.items()}
-        values["value"] = self._learn_critic(data, passes)
+        found = learn_in_order(updates, parts, advantage, order, passes, compound=self.in_turn, stop=stop)
+        value = self._learn_critic(data, passes, stop)
         self.normaliser.update(batch["observation"])
-        return values | {"explained_variance": float(data["explained"][0])}
+        if stop():
+            return {}
+        values = {f"{n}/{agent}": v for agent, own in zip(self.agents, found, strict=True) for n, v in own.items()}
+        return values | {"value": value, "explained_variance": float(data["explained"][0])}
 
     def _parts(self, data: TensorDict) -> list[TensorDict]:
         """The transitions as each agent sees them, in the order of the agents."""
@@ -117,10 +121,12 @@ class MultiAgentPPO:
             for k, columns in enumerate(self.agents.values())
         ]
 
-    def _learn_critic(self, data: TensorDict, passes: Passes) -> float:
-        """Gradient steps of the value of the joint observation; the mean loss."""
+    def _learn_critic(self, data: TensorDict, passes: Passes, stop: Stop) -> float:
+        """Gradient steps of the value of the joint observation; the mean loss, NaN if `stop` said yes."""
         losses = []
         for index in (index for one in passes for index in one.split(self.config.minibatch)):
+            if stop():
+                return float("nan")
             value, target = self.critic(data["features"][index]), data["value_target"][index]
             loss = self.config.value * nn.functional.mse_loss(value, target)
             _descend(self.critic_adam, loss, list(self.critic.parameters()), self.config.grad_norm, "critic")
@@ -161,13 +167,20 @@ class AgentUpdate:
         """The adapted learning rate."""
         return self.optimiser.param_groups[0]["lr"]
 
-    def learn(self, data: TensorDict, passes: Passes) -> dict[str, float]:
+    def learn(self, data: TensorDict, passes: Passes, stop: Stop = never) -> dict[str, float]:
         """Gradient steps on transitions (B,) with `features`, `action`, `action_log_prob` and `advantage` (B, 1).
 
         Returns:
-            Means over the gradient steps by name, and the divergence of the last pass, which adapts the learning rate.
+            Means over the gradient steps by name, and the divergence of the last pass, which adapts the learning rate;
+            nothing if `stop` said yes.
         """
-        steps = [[self._step(data[index]) for index in one.split(self.config.minibatch)] for one in passes]
+        steps: list[list[Tensor]] = []
+        for one in passes:
+            steps.append([])
+            for index in one.split(self.config.minibatch):
+                if stop():
+                    return {}
+                steps[-1].append(self._step(data[index]))
         divergence = float(torch.stack([values[-1] for values in steps[-1]]).mean())
         _set_learning_rate(self.optimiser, adapted(self.learning_rate, divergence, self.config))
         means = torch.stack([values for one in steps for values in one]).mean(0).tolist()
@@ -209,6 +222,7 @@ def learn_in_order(
     passes: Passes,
     *,
     compound: bool,
+    stop: Stop = never,
 ) -> list[dict[str, float]]:
     """Let each agent learn from the advantage of the joint action.
 
@@ -220,6 +234,7 @@ def learn_in_order(
         passes: over the transitions, with which each of them learns.
         compound: HAPPO: the advantage of an agent is multiplied by M, the product of the probability ratios of those
             that have learned before it. Otherwise it stays as it is, and the order is of no consequence.
+        stop: asked before every gradient step; once it says yes, none is taken.
 
     Returns:
         What `AgentUpdate.learn` returned for each agent, in the order of `updates`; with `compound` also the deviation
@@ -229,7 +244,9 @@ def learn_in_order(
     factor = torch.ones_like(advantage)
     for k in order:
         data = parts[k].set("advantage", factor * advantage)
-        found[k] = updates[k].learn(data, passes)
+        found[k] = updates[k].learn(data, passes, stop)
+        if stop():
+            break
         if compound:
             found[k]["factor_std"] = float(factor.std())
             factor = factor * updates[k].ratio(data)

@@ -13,6 +13,7 @@ from dora.agents.config import PPOConfig
 from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, GaussianActor, LatestOutput, Normaliser, Policy, for_loss
 from dora.agents.learners.pull import pull
+from dora.agents.learners.stopping import Stop, never
 
 ADAM_EPSILON = 1e-8
 """Adam's epsilon, far below the gradients of values that are mean rewards."""
@@ -84,8 +85,8 @@ class PPO:
         for group in self.optimiser.param_groups:
             group["lr"] = value
 
-    def update(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from a batch (N, T) and return the means of the losses by name.
+    def update(self, batch: TensorDictBase, stop: Stop = never) -> dict[str, float]:
+        """Learn from a batch (N, T) and return the means of the losses by name; nothing if `stop` said yes.
 
         The very first batch only sets the normaliser, since unscaled observations would teach nothing good.
         """
@@ -99,6 +100,9 @@ class PPO:
         for _ in range(self.config.epochs):
             divergences.clear()
             for index in torch.randperm(len(data)).split(self.config.minibatch):
+                if stop():
+                    self.normaliser.update(batch["observation"])
+                    return {}
                 values = self._step(data[index])
                 losses.append(values)
                 divergences.append(values[-1])

@@ -15,6 +15,7 @@ from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, LatestOutput, Normaliser, Policy, TanhActor, for_loss
 from dora.agents.learners.pull import pull
 from dora.agents.learners.replay import Replay
+from dora.agents.learners.stopping import Stop, never
 
 ACTOR_PERIOD = 2
 """Gradient steps of the critics per gradient step of actor and temperature."""
@@ -82,8 +83,11 @@ class SAC:
         self.updates, self.due = int(counters["updates"]), counters["due"]
         self.replay.added = int(counters["added"])
 
-    def update(self, batch: TensorDictBase) -> dict[str, float]:
-        """Store a batch (N, T), learn from the replay buffer and return the means of the losses by name."""
+    def update(self, batch: TensorDictBase, stop: Stop = never) -> dict[str, float]:
+        """Store a batch (N, T), learn from the replay buffer and return the means of the losses by name.
+
+        Gradient steps that are left when `stop` says yes stay due, and are taken after the next batch.
+        """
         stored = multi_step(batch, self.config.n_step, self.config.gamma)
         stored["next", "reward"] *= 1 - self.config.gamma
         self.replay.extend(stored.reshape(-1))
@@ -93,7 +97,7 @@ class SAC:
         self.due += batch.numel() * self.config.updates_per_step
         critic: list[Tensor] = []
         actor: list[Tensor] = []
-        while self.due >= 1.0:
+        while self.due >= 1.0 and not stop():
             self.due -= 1.0
             sample = self._sample()
             critic.append(self._learn_critic(sample))

@@ -198,7 +198,7 @@ class Trainer:
             start = time.perf_counter()
             batch = rollouts.collect(interrupt.check)
             collected = time.perf_counter()
-            values = self.learner.update(batch)
+            values = self.learner.update(batch, lambda: interrupt.requested)
             check_modules(self.learner.modules)
             counters.env_steps += batch.numel()
             self._count_nonfinite(batch, progress)
@@ -209,6 +209,7 @@ class Trainer:
             self._spend("learn", learned - collected)
             rate = batch.numel() / (learned - start)
             self._log_iteration(log, values, ended, rate)
+            interrupt.check()
             if self._evaluation_is_due() and self._evaluate(log, progress, interrupt):
                 break
             if time.monotonic() - saved > config.checkpoint_seconds:
