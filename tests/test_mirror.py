@@ -149,6 +149,7 @@ def test_meshes_are_those_that_the_urdf_names(copied: Path, tmp_path: Path):
         ("meshes/palm.stl", b"solid palm", "palm.stl is no .glb file"),
         ("meshes/palm.glb", b"spoiled", "the header of .*palm.glb is not valid JSON"),
         ("meshes/palm.glb", glb({"meshes": [{}], "nodes": [{"mesh": 0}]}), "palm.glb is no intact glTF"),
+        ("meshes/palm.glb", glb({"scene": 0, "scenes": [{"nodes": []}]}), "palm.glb shows nothing"),
         ("meshes/palm.glb", glb({"accessors": [{"count": 10**10}]}), "palm.glb declares 10000000000 numbers"),
         ("meshes/palm.glb", glb(b'{"a":' + b"[" * 100_000), "is not valid JSON"),
     ],

@@ -154,6 +154,8 @@ def _mesh_image(path: Path) -> bytes:
         ) from error
     if faces > MOST_FACES:
         raise InputError(f"{path} has {faces} faces; reduce it to at most {MOST_FACES}.")
+    if not image.geometry:
+        raise InputError(f"the mesh {path} shows nothing; export it again.")
     for part in image.geometry.values():
         check_triangles(path, np.asarray(part.vertices), np.asarray(part.faces))
     return cast(bytes, image.export(file_type="glb", include_normals=True))
