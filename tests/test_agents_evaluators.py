@@ -137,6 +137,17 @@ def test_what_a_task_reports_is_counted():
     plain.close()
 
 
+@pytest.mark.parametrize(("guidance", "asked"), [("affordance", True), ("affordance", False), ("none", True)])
+def test_the_zero_action_is_evaluated_where_it_is_asked_for_and_corrects_something(guidance: str, asked: bool):
+    """Without a prior it is an ordinary command and no baseline."""
+    config = dataclasses.replace(CONFIG, workers=1, guidance=guidance, final_episodes=2)
+    evaluators = Evaluators(PointMass, config)
+    policy = make_learner(config, *evaluators.sizes).policy
+    zero = evaluators.final(policy, zero=asked, first_seed=0)[1]
+    assert (zero is not None) == (asked and guidance == "affordance")
+    evaluators.close()
+
+
 def test_seeds_of_evaluations_do_not_meet():
     ranges = [(0, TRAINING_SEEDS), (PERIODIC_SEED, PERIODIC_SEED + STARTS), (FINAL_SEED, FINAL_SEED + STARTS)]
     ranges += [(first := first_seed(seed, STARTS), first + STARTS) for seed in (0, 1, 2, 7, MOST_SEEDS - 1)]

@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 from test_agents_multi import AGENTS, BOTH, SIZES, learner_of
 from test_agents_train import BASE
 
-from dora.agents.agent_columns import AgentColumns
+from dora.agents.agent_columns import MOST_AGENTS, AgentColumns, checked_agents
 from dora.agents.checkpoint import Checkpoint, check_belongs, read_checkpoint
 from dora.agents.collecting.task_env import TaskEnv
 from dora.agents.config import HAPPOConfig, MAPPOConfig
@@ -86,6 +86,16 @@ def test_wrong_agents_are_refused_in_one_sentence(stored: tuple[Path, MultiAgent
     task.agent_columns = WRONG[words]
     with pytest.raises(InputError, match=f"agent_columns of the task.*{words}"):
         _ = TaskEnv(task).agents
+
+
+@pytest.mark.parametrize("count", [64, 65])
+def test_a_task_has_at_most_sixty_four_agents(count: int):
+    agents = {f"arm{k}": ([0], [k]) for k in range(count)}
+    if count <= MOST_AGENTS:
+        assert list(checked_agents(agents, (1, count), "the test")) == list(agents)
+    else:
+        with pytest.raises(InputError, match="at most 64 names"):
+            checked_agents(agents, (1, count), "the test")
 
 
 def test_tasks_that_name_no_agents_have_none():

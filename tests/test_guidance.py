@@ -152,6 +152,8 @@ def test_a_filtered_pose_is_the_running_mean_of_what_was_measured():
     keys = torch.rand(n, generator=torch.Generator().manual_seed(0))
     raw, filtered = (Perturbations(preset, n, 26, {"arm": 20}, 0.05, CPU, share) for share in (1.0, share))
     choice, s = {"arm": CandidateChoice(along_x(0.1), n, CPU)}, invented(n)
+    assert "arm_count" in filtered.buffers
+    assert "arm_count" not in raw.buffers
     measured, spread = [], []
     for one in (raw, filtered):
         one.begin(torch.arange(n), keys)
