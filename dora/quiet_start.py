@@ -7,13 +7,19 @@ import os
 import select
 import signal
 import sys
+import threading
+import time
 from collections.abc import Callable
 from typing import TextIO
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Signals that end a command."""
+GRACE = 10.0
+"""Time that a command has for its end after a signal [s]."""
 UNREAD = 128 + signal.SIGPIPE
 """Exit status when nobody reads what a command prints."""
+_saying, _said = threading.RLock(), False
+"""Held while the line about a signal is printed, in a handler that another signal may interrupt; whether it was."""
 
 
 def _end(number: int, frame: object) -> None:
@@ -21,9 +27,23 @@ def _end(number: int, frame: object) -> None:
     os._exit(128 + number)
 
 
+def _interrupt(number: int, frame: object) -> None:
+    _say()
+    raise KeyboardInterrupt
+
+
 def _terminate(number: int, frame: object) -> None:
-    os.write(2, b"Interrupted.\n")
+    _say()
     raise SystemExit(128 + number)
+
+
+def _say() -> None:
+    """Tell of the first signal, whichever thread comes to it first; the line stands there when this returns."""
+    global _said
+    with _saying:
+        if not _said:
+            os.write(2, b"Interrupted.\n")
+            _said = True
 
 
 def begin() -> None:
@@ -33,17 +53,33 @@ def begin() -> None:
 
 
 def call(main: Callable[[], int]) -> int:
-    """Exit status of a command: Ctrl-C raises in it as usual, SIGTERM ends it, and neither shows a traceback."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Exit status of a command: Ctrl-C raises `KeyboardInterrupt` in it, SIGTERM ends it, neither shows a traceback.
+
+    A line says so at once, also during a call of native code, which delays all that Python does after a signal. A
+    command that has not ended `GRACE` later, because that call takes so long, is ended without it.
+    """
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    threading.Thread(target=_watch, args=(reading,), name="signals", daemon=True).start()
+    signal.signal(signal.SIGINT, _interrupt)
     signal.signal(signal.SIGTERM, _terminate)
+    signal.set_wakeup_fd(writing, warn_on_full_buffer=False)  # it gets the number of a signal when that arrives
     try:
         return main()
     except KeyboardInterrupt:
-        os.write(2, b"Interrupted.\n")
         return 128 + signal.SIGINT
     finally:
         for number in SIGNALS:  # the command is done, the interpreter only cleans up
             signal.signal(number, signal.SIG_IGN)
+
+
+def _watch(reading: int) -> None:
+    """In a thread: answers the first signal that the command leaves to this module."""
+    while number := os.read(reading, 1):
+        if number[0] in SIGNALS and signal.getsignal(number[0]) in (_interrupt, _terminate):
+            _say()
+            time.sleep(GRACE)
+            os._exit(128 + number[0])
 
 
 def printing(main: Callable[[], int]) -> int:
