@@ -2,11 +2,13 @@
 
 import contextlib
 import csv
+import glob
 import hashlib
 import io
 import json
 import os
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -31,6 +33,8 @@ MOST_BYTES = 2**29
 """Size of a safetensors file above which it is not read [bytes]."""
 MOST_HEADER = 4_000_000
 """Size of the header of a safetensors file above which it is not read [bytes]."""
+LEFT_SECONDS = 3600.0
+"""Age above which a file of a cache that is still half written has no writer any more [s]."""
 CHUNK = 2**20
 """Size of the pieces in which a file's digest is computed [bytes]."""
 
@@ -194,7 +198,7 @@ def stored_or_made(
 ) -> Content:
     """What a file of a cache holds, or what is made where there is no intact file.
 
-    A cache that cannot be written is done without.
+    A cache that cannot be written is done without. What a killed process left half written of this file is removed.
 
     Args:
         path: of the file.
@@ -208,6 +212,9 @@ def stored_or_made(
     content = make()
     with contextlib.suppress(InputError, OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
+        for half in path.parent.glob(f".{glob.escape(path.name)}.*"):
+            if time.time() - half.stat().st_mtime > LEFT_SECONDS:
+                half.unlink()
         save(path, content)
     return content
 

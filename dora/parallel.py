@@ -4,12 +4,14 @@ import contextlib
 import functools
 import math
 import os
+import platform
 import re
 import shutil
 import signal
 import tempfile
 import threading
 import time
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -48,6 +50,8 @@ SHARED = Path("/dev/shm")
 """Where the system keeps semaphores by name."""
 LEFT = re.compile(r"(?:sem\.mp-)?dora-(?P<space>\d+)-(?P<process>\d+)-(?P<start>\d+)-.*")
 """Name of a semaphore or temporary folder with the process that made it, see `name_of_process`."""
+BESIDE = 50
+"""Characters of a target's name in that of the folder beside it; names have at most 255 bytes."""
 DIED = "A worker process died (a crash in native code, or too little memory): run with one process to see why."
 """Message of the error after the death of a worker."""
 
@@ -210,9 +214,29 @@ def name_leftovers() -> None:
                 shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-def _is_left(path: Path) -> bool:
-    """Whether a file was made by a process of this user that is gone; False for what may belong to anything else."""
-    found = LEFT.fullmatch(path.name)
+def folder_beside(target: Path) -> Path:
+    """Make a folder beside a target for what will get its name when it is whole, and remove those that processes of
+    this user and machine left there for the same target, which are gone. Another process's stays.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    machine = zlib.crc32(platform.node().encode())  # another one may write on the same disk, with the same numbers
+    place, beginning = target.absolute().parent, f".{target.name[:BESIDE]}.{machine:08x}."
+    for path in place.iterdir():
+        if path.name.startswith(beginning) and _is_left(path, beginning):
+            shutil.rmtree(path, ignore_errors=True)
+    return Path(tempfile.mkdtemp(dir=place, prefix=beginning + name_of_process()))
+
+
+def _is_left(path: Path, beginning: str = "") -> bool:
+    """Whether a file was made by a process of this user that is gone; False for what may belong to anything else.
+
+    Args:
+        path: of the file.
+        beginning: of its name, before that of the process.
+    """
+    found = LEFT.fullmatch(path.name.removeprefix(beginning))
     try:
         if found is None or int(found["space"]) != _namespace() or path.stat().st_uid != os.getuid():
             return False

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,10 +18,11 @@ import torch
 from commands import call, load_command
 from gymnasium.envs.registration import EnvSpec
 
+from dora import parallel
 from dora.configs import plain
 from dora.datasets.episodes import Plan, make_batch, roll_out
 from dora.datasets.facts import facts_of
-from dora.datasets.record import FORMATS, record_dataset
+from dora.datasets.record import FORMATS, new_folder, record_dataset
 from dora.datasets.sources import find_source
 from dora.errors import InputError
 from dora.sim import can_render
@@ -160,6 +162,26 @@ def test_nothing_is_left_of_an_interrupted_recording(tmp_path: Path, monkeypatch
     with pytest.raises(KeyboardInterrupt):
         record_dataset("minari", find_source(ENV, "scripted", "none"), Plan(1), tmp_path / "out", progress=interrupted)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_recording_left_is_removed_by_the_next_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Not that of another target, nor of a process that is still at work."""
+    target, other, long = tmp_path / "out[1]", tmp_path / "out[1].b", tmp_path / ("o" * 255)
+    with new_folder(target) as working:
+        with monkeypatch.context() as patch:
+            patch.setattr(parallel, "name_of_process", lambda: f"dora-{parallel._namespace()}-4194305-7-")  # it is gone
+            for path in (target, other):
+                (parallel.folder_beside(path) / "data").mkdir()
+        assert len(list(tmp_path.iterdir())) == 3
+        for path in (long, target):
+            with new_folder(path) as place:
+                assert place != working
+                shutil.copy(__file__, place / "whole")
+        assert working.is_dir()
+        left = {path.name for path in tmp_path.iterdir()} - {target.name, long.name, working.name}
+        assert len(left) == 1
+        assert left.pop().startswith(f".{other.name}.")
+        shutil.rmtree(target)
 
 
 @pytest.mark.slow

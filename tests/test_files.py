@@ -1,5 +1,6 @@
 """Files: what was written is read, and nothing else is; a write replaces a file wholly or not at all."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from dora.files import (
     METADATA,
     read_safetensors,
     read_tensors,
+    stored_or_made,
     write_bytes,
     write_csv,
     write_safetensors,
@@ -106,3 +108,17 @@ def test_a_file_can_be_read_by_others(tmp_path: Path):
     write_csv(tmp_path / "t.csv", ["a", "b"], [[1, 0.12345678], ["x", 2.0]])
     assert (tmp_path / "t.csv").read_text() == "a,b\n1,0.123457\nx,2\n"
     assert (tmp_path / "t.csv").stat().st_mode & 0o777 == 0o644
+
+
+def test_what_a_killed_process_left_half_written_in_a_cache_is_removed(tmp_path: Path):
+    """Not what another process may be writing, nor what belongs to another file."""
+    path = tmp_path / "found[1].json"
+    old, new, other = (
+        tmp_path / name for name in (f".{path.name}.aaaaaaaa", f".{path.name}.bbbbbbbb", ".x.json.cccccccc")
+    )
+    for half in (old, new, other):
+        half.touch()
+    for half in (old, other):
+        os.utime(half, (0, 0))
+    assert stored_or_made(path, Path.read_bytes, lambda: b"made", write_bytes) == b"made"
+    assert sorted(tmp_path.iterdir()) == sorted([path, new, other])

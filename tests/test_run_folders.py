@@ -112,6 +112,8 @@ def test_what_a_killed_run_left_half_written_is_removed(tmp_path: Path):
     folder.replay.mkdir()
     halves = [folder.path / ".curve.csv.abcd_123", folder.checkpoints / ".latest.safetensors.zyxw9876"]
     halves.append(folder.replay / ".0000000000-0000016384.safetensors.aaaaaaaa")
+    folder.nonfinite.mkdir()
+    halves.append(folder.nonfinite / ".cube-1-2.safetensors.aaaaaaaa")
     others = [folder.path / ".notes", folder.path / ".hidden.toml"]
     for path in halves + others:
         path.write_text("half")

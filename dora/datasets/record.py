@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from dora.datasets.minari import write_minari
 from dora.datasets.tables import require_pyarrow
 from dora.errors import InputError
 from dora.files import make_folder, write_json
+from dora.parallel import folder_beside
 from dora.sim.batch.rendering import can_render
 from dora.version import version_line
 
@@ -73,14 +73,15 @@ def check_possible(kind: str, plan: Plan, folder: Path, pictures: bool) -> None:
 
 @contextlib.contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """A folder beside `folder` that gets its name when the context ends well, and is removed otherwise.
+    """A folder beside `folder` that gets its name when the context ends well, and is removed otherwise; that of a
+    killed process by the next recording.
 
     Raises:
         InputError: something cannot be written, or `folder` has come to exist meanwhile.
     """
     temporary = None
     try:
-        temporary = Path(tempfile.mkdtemp(dir=folder.absolute().parent, prefix=f".{folder.name}."))
+        temporary = folder_beside(folder)
         yield temporary
         os.chmod(temporary, 0o755)
         if os.path.lexists(folder):

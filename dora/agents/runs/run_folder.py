@@ -183,7 +183,7 @@ class RunFolder:
                 raise InputError(
                     f"Another process is training in {self.path}: wait until it ends, or choose another --out."
                 ) from error
-            for place in (self.path, self.checkpoints, self.replay):
+            for place in (self.path, self.checkpoints, self.replay, self.nonfinite):
                 for path in place.glob(".*"):
                     if HALF_WRITTEN.fullmatch(path.name) and path.is_file():
                         path.unlink(missing_ok=True)
