@@ -14,7 +14,7 @@ from typing import TextIO
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Signals that end a command."""
-GRACE = 10.0
+GRACE = 20.0
 """Time that a command has for its end after a signal [s]."""
 UNREAD = 128 + signal.SIGPIPE
 """Exit status when nobody reads what a command prints."""
