@@ -23,6 +23,7 @@ WRONG = [
     ({"num_envs": -1}, "at least 1"),
     ({"num_envs": 2.5}, "whole number"),
     ({"num_envs": True}, "whole number"),
+    ({"num_envs": 1024}, "room for [0-9]+ more environments, and (1024|2048) are needed"),
     ({"num_envs": 100_001}, "from 1 to 100000"),
     ({"num_envs": "4"}, "whole number"),
     ({"sim_backend": "physx_cpu_bach"}, "did you mean 'physx_cpu_batch'"),

@@ -3,6 +3,8 @@
 Every wrapper calls ManiSkill's own code unless the environment runs on that back end.
 """
 
+import ctypes
+import itertools
 from collections.abc import Callable
 from functools import cache, cached_property, partial, wraps
 from importlib.metadata import version
@@ -32,6 +34,8 @@ BACKEND = "physx_cpu_batch"
 """Name of the back end as `sim_backend`."""
 MOST_ENVS = 100_000
 """Largest number of environments of a batch [1]."""
+SPARE = 16
+"""Keys of thread-specific data that are left to others [1]."""
 SUPPORTED = {"mani_skill": "3.0.1", "sapien": "3.0.3"}
 """Versions for which the wrappers are written, by package."""
 
@@ -139,6 +143,37 @@ def _init(original: Callable) -> Callable:
     return init
 
 
+def check_room(count: int) -> None:
+    """Refuse environments for which this process has no room, with which it would be aborted.
+
+    PhysX takes a key of thread-specific data for each of its scenes, and the system has 1024 for a process.
+
+    Args:
+        count: environments that are still to be made.
+
+    Raises:
+        InputError: there are too many.
+    """
+    room = _free_keys(count + SPARE) - SPARE
+    if room < count:
+        raise InputError(
+            f"this process has room for {max(room, 0)} more environments, and {count} are needed (a scene that is "
+            "built anew stands beside the old one for a moment): use fewer, or several processes."
+        )
+
+
+def _free_keys(wanted: int) -> int:
+    """How many of these keys the system still gives to this process; all of them where it has no such keys."""
+    create, delete = (getattr(ctypes.CDLL(None), f"pthread_key_{name}", None) for name in ("create", "delete"))
+    if create is None or delete is None:
+        return wanted
+    keys = [ctypes.c_uint() for _ in range(wanted)]
+    made = list(itertools.takewhile(lambda key: create(ctypes.byref(key), None) == 0, keys))
+    for key in made:
+        delete(key)
+    return len(made)
+
+
 def _setup_scene(original: Callable) -> Callable:
     def setup_scene(self: BaseEnv) -> None:
         """ManiSkill's scene, or a `BatchScene`; InputError if pictures are needed and there is no driver."""
@@ -150,6 +185,7 @@ def _setup_scene(original: Callable) -> Callable:
         if not renderers and self.render_mode is not None:
             logger.warning(f"render_mode {self.render_mode!r} has no effect because there is no renderer.")
         self._set_scene_config()
+        check_room(self.num_envs)
         scenes = [
             sapien.Scene([physx.PhysxCpuSystem(), *(sapien.render.RenderSystem(device) for device in renderers)])
             for _ in range(self.num_envs)

@@ -11,7 +11,7 @@ from dora.affordance.candidates import GraspCandidates
 from dora.configs import check_finite, check_not_negative, check_ranges, overridden
 from dora.errors import InputError, shown
 from dora.robot import available_robots
-from dora.sim.batch.hooks import MOST_ENVS
+from dora.sim.batch.hooks import MOST_ENVS, check_room
 from dora.sim.batch.rendering import can_render, refuse_pictures, wants_pictures
 from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot
 from dora.sim.robots import register_robot
@@ -116,6 +116,7 @@ def check_options(
         )
     if not isinstance(num_envs, int) or not 1 <= num_envs <= MOST_ENVS:
         raise InputError(f"num_envs must be a whole number from 1 to {MOST_ENVS}, not {shown(num_envs)}")
+    check_room(2 * num_envs)  # a reset with a seed builds the scene anew, beside the old one
     robots = _robots(robot_uids, arms)
     mode = control_mode or CONTROL_MODES[0]
     if hand_joints == 15 and not mode.endswith(COUPLED):
