@@ -59,7 +59,6 @@ def test_damaged_files_are_refused(path: Path, tmp_path: Path):
     ("name", "value", "words"),
     [
         ("curve", 3, "curve must be"),
-        ("curve", [[10**400, 2.0, 0.5]], "curve has to be rows"),
         ("curve", [[1, 2.0, "much"]], "curve has to be rows"),
         ("curve", [[-1, 2.0, 0.5]], "curve has to be rows"),
         ("env_steps", -1, "env_steps is -1"),
@@ -70,7 +69,6 @@ def test_damaged_files_are_refused(path: Path, tmp_path: Path):
         ("best", [0.5], "best has to be a success rate and a return"),
         ("best", [1.5, 3.0], "best has to be a success rate and a return"),
         ("seconds", {"collect": 1.0}, "seconds has to be"),
-        ("learner", {"added": 10**400}, "learner has to be finite numbers"),
         ("learner", {"added": "all"}, "learner has to be finite numbers"),
         ("learner", [3], "learner has to be finite numbers"),
         ("epochs", 3, "has no field 'epochs'"),

@@ -139,7 +139,7 @@ def test_an_advantage_is_multiplied_by_the_ratios_of_those_before(order: list[in
         def __init__(self, ratio: list[float]):
             self.after, self.seen = torch.tensor(ratio)[:, None], torch.empty(0)
 
-        def learn(self, data: TensorDict, passes: Any) -> dict[str, float]:
+        def learn(self, data: TensorDict, passes: Any, stop: Any = None) -> dict[str, float]:
             self.seen = data["advantage"].clone()
             return {}
 
@@ -205,7 +205,7 @@ def test_in_the_matrix_game_agents_in_turn_never_lose_and_agents_at_once_do():
 def test_the_order_of_agents_is_drawn_anew_only_where_it_matters(monkeypatch: pytest.MonkeyPatch):
     seen: list[list[int]] = []
 
-    def keep(updates: Any, parts: Any, advantage: Tensor, order: Any, passes: Any, *, compound: bool) -> Any:
+    def keep(updates: Any, parts: Any, advantage: Tensor, order: Any, passes: Any, *, compound: bool, stop: Any) -> Any:
         seen.append(list(order))
         assert float(advantage.mean()) == pytest.approx(0, abs=1e-5)
         assert float(advantage.std(correction=0)) == pytest.approx(1, abs=1e-3)
