@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from dora.errors import InputError
+from dora.errors import InputError, shown
 
 SEEDS = 2**32
 """Number of seeds that numpy's generators take [1]: 0 and up."""
@@ -58,7 +58,9 @@ def _stacked(value: Any, what: str) -> Tensor:
 
 
 def _dense(value: Tensor, what: str) -> Tensor:
-    """A tensor of real numbers that is neither sparse, nor quantised, nor nested."""
+    """A tensor of real numbers that is neither sparse, nor quantised, nor nested, and has values."""
+    if value.is_meta:
+        raise InputError(f"{what} is a tensor on the device meta, which holds no numbers: pass one on cpu.")
     if value.is_complex():
         raise InputError(f"{what} must be real numbers, not complex ones.")
     if value.is_quantized:
@@ -140,6 +142,18 @@ def checked_rows(rows: Any, count: int, device: torch.device | str | None = None
     if len(index.unique()) < len(index):
         raise InputError(f"env_idx has an environment twice: {numbers}.")
     return index
+
+
+def checked_truth(value: Any, what: str) -> bool:
+    """A truth value, or 0 or 1, of Python, numpy or torch as one of Python.
+
+    Raises:
+        InputError: for anything else.
+    """
+    scalar = value.item() if isinstance(value, np.generic | np.ndarray | Tensor) and not value.ndim else value
+    if not isinstance(scalar, bool | int | float) or scalar not in (0, 1):
+        raise InputError(f"{what} must be True or False, not {shown(value)}.")
+    return bool(scalar)
 
 
 def checked_seeds(seed: Any, count: int) -> int | list[int] | None:

@@ -148,6 +148,8 @@ def test_whole_numbers_of_any_byte_order_become_tensors():
         (lambda: [np.ma.array([1.0], mask=[True])], "masked array"),
         (lambda: torch.quantize_per_tensor(torch.zeros(2), 0.1, 0, torch.qint8), "quantised"),
         (lambda: torch.nested.nested_tensor([torch.zeros(2), torch.zeros(3)]), "nested"),
+        (lambda: torch.zeros(2, device="meta"), "device meta"),
+        (lambda: [torch.zeros(2, device="meta")], "device meta"),
         (lambda: np.array([2**63], np.uint64), "at most 9223372036854775807"),
         (lambda: (number for number in [1]), "must be numbers, not generator"),
     ],

@@ -1,6 +1,6 @@
-"""Options of reset and parts of states: what is wrong is told in one sentence, before anything is changed."""
+"""Options of `reset` are checked, all of them, before anything is set: on `physx_cpu_batch` and in tasks of ours."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -8,77 +8,89 @@ import numpy as np
 import pytest
 import torch
 
+from dora.arguments import taken
 from dora.errors import InputError
 from dora.sim import BACKEND
+from dora.sim.batch.resets import START
 
-START = "reset_to_env_states"
+OURS, STOCK = "DoraCube-v1", "PickCube-v1"
+COUNT = 3
 
 
-@pytest.fixture(scope="module", params=["PickCube-v1", "DoraCube-v1"])
+def make(env_id: str, **options: Any) -> Any:
+    settings: Any = {"sim_backend": BACKEND, "render_backend": "none", "obs_mode": "state", **options}
+    return gym.make(env_id, num_envs=COUNT, **settings)
+
+
+@pytest.fixture(scope="module", params=[OURS, STOCK])
 def env(request: pytest.FixtureRequest) -> Iterator[Any]:
-    made = gym.make(request.param, num_envs=2, sim_backend=BACKEND, obs_mode="state", render_backend="none")
-    made.reset(seed=0)
-    yield made.unwrapped
-    made.close()
+    """An environment whose controllers have targets."""
+    env: Any = make(request.param, **({} if request.param == OURS else {"control_mode": "pd_joint_target_delta_pos"}))
+    yield env
+    env.close()
 
 
-def changed(**parts: Any) -> Callable[[Any], dict[str, Any]]:
-    """A whole state with these parts in place of its own."""
-    return lambda env: {START: {"env_states": env.get_state_dict() | parts}}
+def test_states_that_would_set_nothing_or_half_are_refused(env: Any):
+    env.reset(seed=0)
+    state = env.unwrapped.get_state_dict()
+    name = next(iter(state["actors"]))
+    cases: list[tuple[Any, str]] = [
+        ({}, "nothing in 'actors'|lacks 'actors'"),
+        ({"controller": state["controller"]}, "nothing in 'actors'|lacks 'actors'"),
+        (state | {"articulations": 5}, "must be a dictionary"),
+        (state | {"actors": [1, 2]}, "must be a dictionary"),
+        (state | {"actors": {name: {"p": [1]}}}, "must be rows"),
+        (state | {"actor": state["actors"]}, "'actor'.*did you mean 'actors'"),
+        ({"articulation": state["articulations"]}, "did you mean 'articulations'"),
+    ]
+    for wrong, words in cases:
+        with pytest.raises(InputError, match=words) as error:
+            env.unwrapped.set_state_dict(wrong)
+        assert "\n" not in str(error.value)
+        assert torch.equal(env.unwrapped.get_state_dict()["actors"][name], state["actors"][name])
 
 
-OPTIONS: list[tuple[str, Callable[[Any], Any], str]] = [
-    ("slip env_ids", lambda env: {"env_ids": [0]}, "did you mean 'env_idx'"),
-    ("slip states", lambda env: {"reset_to_env_state": {}}, "did you mean 'reset_to_env_states'"),
-    ("word", lambda env: {"reconfigure": "no"}, "True or False"),
-    ("number", lambda env: {"reconfigure": 1}, "True or False"),
-    ("rebuild of some", lambda env: {"reconfigure": True, "env_idx": [0]}, "a scene is built for all"),
-    ("no states", lambda env: {START: {"env_states": None}}, "dictionary with 'env_states'"),
-    ("only obs", lambda env: {START: {"obs": np.zeros((2, 3))}}, "dictionary with 'env_states'"),
-    ("empty", lambda env: {START: {"env_states": {}}}, "env_states is empty"),
-    ("slip actor", lambda env: {START: {"env_states": {"actor": {}}}}, "its parts are"),
-    ("number for actors", changed(actors=5), r"env_states\['actors'\] must be a dictionary"),
-    ("list for robots", changed(articulations=[1, 2]), "must be a dictionary"),
-    ("number for controller", changed(controller=5), r"env_states\['controller'\] must be a dictionary"),
-    ("unknown controller", changed(controller={"third_arm": np.zeros((2, 3))}), "third_arm"),
-    ("obs of another size", lambda env: {
-        START: {"env_states": env.get_state_dict(), "obs": np.zeros((2, 3))}}, r"obs'\] has shape \(2, 3\)"),
-    ("obs of too many", lambda env: {"env_idx": [1], START: {
-        "env_states": env.get_state_dict(), "obs": env.get_obs()}}, "has shape|env_states|needed"),
-]  # fmt: skip
-"""Names, options that are wrong, and words of the answer."""
+def test_options_that_cannot_be_are_refused_before_anything_is_set(env: Any):
+    env.reset(seed=0)
+    obs = env.step(env.action_space.sample())[0]
+    state = env.unwrapped.get_state_dict()
+    target = next(iter(state["controller"]))
+    shaped = {"env_states": state, "obs": obs[:, 1:]}
+    cases: list[tuple[Any, str]] = [
+        ({"env_ids": [0]}, "did you mean 'env_idx'"),
+        ({"ENV_IDX": [0]}, "did you mean 'env_idx'"),
+        ({"reset_to_env_state": {"env_states": state}}, f"did you mean '{START}'"),
+        ({"reconfigure": "no"}, "True or False"),
+        ({"reconfigure": True, "env_idx": [0]}, "builds all environments anew"),
+        ({START: {"env_states": None}}, "'env_states'"),
+        ({START: {"env_states": state, "observation": obs}}, "perhaps 'obs'"),
+        ({START: shaped}, "obs has shape"),
+        ({START: shaped | {"obs": {"state": obs}}}, "obs has names"),
+        ({"env_idx": [0], START: {"env_states": taken(state, torch.tensor([0])), "obs": obs}}, "obs has shape"),
+        ({START: {"env_states": state | {"controller": 5}}}, "must be a dictionary"),
+        ({START: {"env_states": state | {"controller": {"x": 5}}}}, "'x'"),
+        ({START: {"env_states": state | {"controller": {target: [1, 2]}}}}, "controller"),
+        ({START: {"env_states": state | {"articulations": 5}}}, "must be a dictionary"),
+        ({START: {"env_states": np.zeros((COUNT, 7))}}, "the state has shape"),
+    ]
+    before, random = env.unwrapped.get_state(), env.unwrapped._batched_main_rng.rngs[0].get_state()[1].copy()
+    steps = env.unwrapped.elapsed_steps.clone()
+    for options, words in cases:
+        with pytest.raises(InputError, match=words) as error:
+            env.reset(seed=3 if "env_idx" not in options else None, options=options)
+        assert "\n" not in str(error.value)
+        assert torch.equal(env.unwrapped.get_state(), before), options
+        assert torch.equal(env.unwrapped.elapsed_steps, steps), options
+        assert (env.unwrapped._batched_main_rng.rngs[0].get_state()[1] == random).all(), options
 
 
-@pytest.mark.parametrize(("options", "words"), [case[1:] for case in OPTIONS], ids=[case[0] for case in OPTIONS])
-def test_wrong_options_of_reset_change_nothing(env: Any, options: Callable[[Any], Any], words: str):
-    given, before = options(env), env.get_state()
-    with pytest.raises(InputError, match=words) as error:
-        env.reset(options=given)
-    assert "\n" not in str(error.value)
-    assert torch.equal(env.get_state(), before)
-    assert env.step(env.action_space.sample() * 0)[0].isfinite().all()
+def test_options_that_tasks_know_and_truth_values_of_any_form_pass(env: Any):
+    given = {"episode_id": 3, "build_config_idxs": [0], "mine": 1, "reconfigure": np.bool_(False), "env_idx": None}
+    assert not env.reset(options=given)[1]["reconfigure"]
 
 
-STATES: list[tuple[str, Any, str]] = [
-    ("empty", {}, "the state (is empty|lacks)"),
-    ("slip", {"actor": {}}, "its parts are|lacks"),
-    ("number for robots", {"actors": {}, "articulations": 5}, "must be a dictionary|is missing"),
-    ("list for actors", {"actors": [1, 2], "articulations": {}}, "must be a dictionary|is missing"),
-]
-
-
-@pytest.mark.parametrize(("state", "words"), [case[1:] for case in STATES], ids=[case[0] for case in STATES])
-def test_wrong_states_change_nothing(env: Any, state: Any, words: str):
-    before = env.get_state()
-    with pytest.raises(InputError, match=words) as error:
-        env.set_state_dict(state)
-    assert "\n" not in str(error.value)
-    assert torch.equal(env.get_state(), before)
-
-
-def test_options_that_a_task_may_know_are_let_through_and_the_others_work(env: Any):
-    env.reset(seed=0, options={"episode_id": 3, "reconfigure": None})
-    env.reset(seed=0, options={"reconfigure": np.bool_(True)})
-    state, obs = env.get_state_dict(), env.get_obs()
-    found = env.reset(options={START: {"env_states": state, "obs": obs}})[0]
-    assert torch.equal(torch.as_tensor(found), torch.as_tensor(obs))
+def test_a_reset_of_some_that_is_due_to_build_all_anew_is_refused():
+    env = make(STOCK, reconfiguration_freq=1)
+    with pytest.raises(InputError, match="reconfiguration_freq is 1"):
+        env.reset(options={"env_idx": [0]})
+    env.close()

@@ -21,6 +21,7 @@ from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS
 from mani_skill.utils.registration import EnvSpec
 from mani_skill.utils.structs.types import SimConfig
 
+from dora.arguments import checked_truth
 from dora.errors import InputError, shown, suggestion
 from dora.sim.batch.hooks import BACKEND, batched_by_default
 from dora.sim.cameras import check_settings
@@ -162,10 +163,7 @@ def _typed(name: str, value: Any, annotation: Any) -> Any:
     if kinds == {str} and not isinstance(value, str):
         raise InputError(f"{name} must be a text, not {shown(value)}.")
     if kinds == {bool}:
-        scalar = value.item() if isinstance(value, np.generic | np.ndarray | torch.Tensor) and not value.ndim else value
-        if not isinstance(scalar, bool | int | float) or scalar not in (0, 1):
-            raise InputError(f"{name} must be True or False, not {shown(value)}.")
-        return bool(scalar)
+        return checked_truth(value, name)
     if kinds == {int}:
         if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
             raise InputError(f"{name} is {shown(value)}: it must be a whole number.")

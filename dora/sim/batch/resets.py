@@ -6,19 +6,21 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Int
+from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils import common
 from torch import Tensor
 
-from dora.arguments import as_tensor, checked_rows, checked_seeds, is_mask, tensors
+from dora.arguments import as_tensor, checked_rows, checked_seeds, checked_truth, is_mask, tensors
 from dora.errors import InputError, shown, suggestion
 
 START, STATES = "reset_to_env_states", "env_states"
 """Option of `reset` with states in which episodes begin, and its entry for them."""
-OPTIONS, LIKE = ("env_idx", "reconfigure", START), 0.8
-"""Options of `reset` that every task has, and how like one of them another name is that is taken for a slip [1]."""
+OPTIONS = ("env_idx", "reconfigure", START)
+"""Options of `reset` that ManiSkill knows."""
+OPTIONS_OF_TASKS = ("episode_id", "build_config_idxs", "init_config_idxs")
+"""Options that tasks of ManiSkill know besides; others may have further ones."""
 KINDS = ("actors", "articulations")
 """Parts of a state that ManiSkill restores."""
 QUATERNION, UNIT = slice(3, 7), 0.01
@@ -38,53 +40,35 @@ def checked_options(options: Any, count: int, device: torch.device) -> dict[str,
         device: where tensors are wanted.
 
     Raises:
-        InputError: the options, `env_idx` or the states are of another kind.
+        InputError: the options, `env_idx` or the states are of another kind, or a name is nearly one of `OPTIONS`.
     """
     if options is None:
         return {}
     if not isinstance(options, Mapping):
-        raise InputError(f"the options of reset must be a dictionary, not {options!r}.")
+        raise InputError(f"the options of reset must be a dictionary, not {shown(options)}.")
     for name in options:
-        near = difflib.get_close_matches(str(name), OPTIONS, 1, LIKE)
-        if near and name not in OPTIONS:
-            raise InputError(f"reset has no option {name!r}: did you mean {near[0]!r}?")
+        if name not in OPTIONS_OF_TASKS + OPTIONS and difflib.get_close_matches(str(name).lower(), OPTIONS, 1):
+            raise InputError(f"reset has no option {name!r}: {suggestion(str(name).lower(), OPTIONS)}")
     out = {name: value for name, value in options.items() if not (name in OPTIONS and value is None)}
-    if not isinstance(again := out.get("reconfigure", False), bool | np.bool_):
-        raise InputError(f"options['reconfigure'] must be True or False, not {shown(again)}.")
     mask = order = None
+    if "reconfigure" in out:
+        out["reconfigure"] = checked_truth(out["reconfigure"], "options['reconfigure']")
     if "env_idx" in out:
         rows = checked_rows(out["env_idx"], count, device)
         mask = rows if is_mask(out["env_idx"]) else None
         out["env_idx"], order = rows.sort()
-        if again and len(rows) < count:
-            raise InputError("options has both reconfigure and some of the environments: a scene is built for all.")
+        if out.get("reconfigure") and len(rows) < count:
+            raise InputError("'reconfigure' builds all environments anew: leave out it, or 'env_idx', in the options.")
     if START in out:
         start = out[START]
-        if not isinstance(start, Mapping) or start.get(STATES) is None:
+        if not isinstance(start, Mapping) or start.get(STATES) is None or not {*start} <= {STATES, "obs"}:
             raise InputError(f"options[{START!r}] must be a dictionary with {STATES!r} and perhaps 'obs'.")
         given = {name: tensors(value, name, device) for name, value in start.items() if value is not None}
         out[START] = {name: _in_order(_of_mask(value, mask, count), order) for name, value in given.items()}
         states = out[START][STATES]
-        if isinstance(states, dict):
-            check_parts(states, STATES)
-            for kind in KINDS:
-                check_finite_state(states.get(kind, {}), f"{STATES}[{kind!r}]")
+        for kind in KINDS if isinstance(states, dict) else ():
+            check_finite_state(states.get(kind, {}), f"{STATES}[{kind!r}]")
     return out
-
-
-def check_parts(state: Mapping[str, Any], what: str) -> None:
-    """Refuse a state that has no part that ManiSkill restores, or one that is no dictionary.
-
-    Raises:
-        InputError: naming the part.
-    """
-    near = [name for name in state if name not in KINDS and difflib.get_close_matches(str(name), KINDS, 1, LIKE)]
-    if near or not any(kind in state for kind in KINDS):
-        has = f"has {', '.join(map(shown, near or state))}" if state else "is empty"
-        raise InputError(f"{what} {has}: its parts are those of get_state_dict, {' and '.join(KINDS)}.")
-    for name in (*KINDS, "controller"):
-        if not isinstance(state.get(name, {}), Mapping):
-            raise InputError(f"{what}[{name!r}] must be a dictionary, not {shown(state[name])}.")
 
 
 def _in_order(state: Any, order: Tensor | None) -> Any:
@@ -117,36 +101,84 @@ def reset(original: Callable, env: Any, seed: Any = None, options: Any = None) -
     rows, start = options.get("env_idx"), options.get(START, {})
     if rows is not None and len(rows) == 0:
         return nothing_reset(env)
+    check_rebuilding(env, options)
+    _check_start(env, start, env.num_envs if rows is None else len(rows), _rebuilds(env, options))
     if "obs" in start:  # ManiSkill writes into the observation that it returned last
         env._last_obs = common.torch_clone_dict(env._last_obs)
     states = start.get(STATES)
     targets = states.get("controller", {}) if isinstance(states, dict) else {}
-    if "obs" in start:
-        _check_like(start["obs"], env._last_obs, env.num_envs if rows is None else len(rows), f"{START}['obs']")
-    if targets:
-        _check_known(targets, env.agent.controller, f"{STATES}['controller']")
     with _controllers_of(env, rows, targets):
         return original(env, seed=seeds, options=options)
 
 
-def _check_like(given: Any, last: Any, count: int, what: str) -> None:
-    """Refuse an observation of `count` environments whose parts or sizes are not those of the last one."""
-    if isinstance(last, Mapping) or isinstance(given, Mapping):
-        if not (isinstance(last, Mapping) and isinstance(given, Mapping) and last.keys() == given.keys()):
-            raise InputError(f"{what} must be an observation of this environment, with all of its parts.")
-        for name, part in last.items():
-            _check_like(given[name], part, count, f"{what}[{name!r}]")
-    elif given.shape != (needed := (count, *last.shape[1:])):
-        raise InputError(f"{what} has shape {tuple(given.shape)} but {tuple(needed)} is needed.")
+def _rebuilds(env: Any, options: Mapping[str, Any]) -> bool:
+    """Whether ManiSkill's `reset` builds the scene anew."""
+    return options.get("reconfigure", False) or (env._reconfig_counter == 0 and env.reconfiguration_freq != 0)
 
 
-def _check_known(targets: Mapping[str, Any], controller: Any, what: str) -> None:
-    """Refuse a state of controllers that names one that there is not."""
-    several = isinstance(controller, dict)
-    known = {uid: each.get_state() for uid, each in controller.items()} if several else controller.get_state()
-    unknown = [name for name in targets if name not in known]
-    if unknown:
-        raise InputError(f"{what} has {shown(unknown[0])}, which the robot has not: {suggestion(unknown[0], known)}")
+def check_rebuilding(env: Any, options: Mapping[str, Any]) -> None:
+    """Refuse a reset of some environments that is due to build the scene of all anew.
+
+    Args:
+        env: the environment.
+        options: as of `checked_options`.
+
+    Raises:
+        InputError: `reconfiguration_freq` asks for a new scene.
+    """
+    if "env_idx" in options and len(options["env_idx"]) < env.num_envs and _rebuilds(env, options):
+        raise InputError(
+            f"reconfiguration_freq is {env.reconfiguration_freq}, and this reset is due to build all environments "
+            "anew: leave out 'env_idx', or make the environment with reconfiguration_freq=0."
+        )
+
+
+def _check_start(env: Any, start: Mapping[str, Any], count: int, rebuilds: bool) -> None:
+    """Refuse states, targets of controllers and observations for `count` environments before anything is set.
+
+    A task with a `set_state_dict` of its own knows what a state of it holds, and a new scene may hold other objects.
+    """
+    states = start.get(STATES)
+    if states is not None and not rebuilds and _has_usual_states(env):
+        if isinstance(states, dict):
+            _checked_parts(env, states, count)
+        else:
+            _checked_flat(env, states, count)
+    if isinstance(states, dict) and "controller" in states:
+        known = env.agent.get_controller_state() if getattr(env, "agent", None) is not None else {}
+        check_finite_state(states["controller"], f"{STATES}['controller']")
+        check_fits(states["controller"], known, count, f"{STATES}['controller']", whole=False)
+    if "obs" in start:
+        check_fits(start["obs"], env._last_obs, count, "obs")
+
+
+def check_fits(given: Any, like: Any, count: int, what: str, *, whole: bool = True) -> None:
+    """Refuse numbers of `count` environments that are not like others in names and shapes; one row stands for all.
+
+    Args:
+        given: nested dicts of tensors.
+        like: the same with a row for each environment; where it is an empty dictionary, nothing is compared.
+        count: how many environments there are.
+        what: how messages call them.
+        whole: whether everything has to be there.
+
+    Raises:
+        InputError: naming the first part that is unknown, missing or of another shape.
+    """
+    if isinstance(like, Mapping):
+        if not isinstance(given, Mapping):
+            raise InputError(f"{what} must be a dictionary with {', '.join(like) or 'no entries'}.")
+        if unknown := [name for name in given if like and name not in like]:
+            raise InputError(f"{what} has {unknown[0]!r}, which is not known here: {suggestion(unknown[0], like)}")
+        if lacking := [name for name in like if whole and name not in given]:
+            raise InputError(f"{what} lacks {lacking[0]!r}: give all of {', '.join(like)}.")
+        for name in given.keys() & like.keys():
+            check_fits(given[name], like[name], count, f"{what}[{name!r}]", whole=whole)
+        return
+    row = tuple(like.shape[1:])
+    if isinstance(given, Mapping) or tuple(given.shape) not in ((count, *row), (1, *row), row):
+        shape = "names" if isinstance(given, Mapping) else f"shape {tuple(given.shape)}"
+        raise InputError(f"{what} has {shape} but numbers of shape {(count, *row)} are needed.")
 
 
 @contextmanager
@@ -201,24 +233,55 @@ def _merged(state: Mapping[str, Any], new: Mapping[str, Any], rows: Tensor) -> d
 def set_state_dict(original: Callable, env: Any, state: Any, env_idx: Any = None) -> None:
     """ManiSkill's `set_state_dict` with arrays, lists or tensors, for all environments or for those of `env_idx`."""
     rows = None if env_idx is None else checked_rows(env_idx, env.num_envs, env.device)
-    if not isinstance(state, Mapping):
-        raise InputError(f"the state must be a dictionary as of get_state_dict, not {type(state).__name__}.")
-    check_parts(state, "the state")
-    state = tensors(state, "state", env.device)
     count = env.num_envs if rows is None else len(rows)
+    state = _checked_parts(env, state, count)
     rows, order = (None, slice(None)) if rows is None else rows.sort()
     for kind in KINDS:
-        known = getattr(env.scene.state_dict_registry, kind)
+        for name, values in state.get(kind, {}).items():
+            state[kind][name] = values[order if _is_everywhere(env, kind, name) else ...]
+    if count:
+        original(env, state, *(() if rows is None else (rows,)))
+
+
+def _has_usual_states(env: Any) -> bool:
+    """Whether a task's states are ManiSkill's, and hold nothing of its own."""
+    return all(getattr(type(env), name) is getattr(BaseEnv, name) for name in ("get_state_dict", "set_state_dict"))
+
+
+def _is_everywhere(env: Any, kind: str, name: str) -> bool:
+    """Whether each environment has an actor or articulation."""
+    return len(getattr(env.scene.state_dict_registry, kind)[name]._objs) == env.num_envs
+
+
+def _checked_parts(env: Any, state: Any, count: int) -> dict[str, Any]:
+    """A state of the simulator as tensors with `count` rows.
+
+    Raises:
+        InputError: a name is unknown, nothing would be set, or a part has another shape or is in no sound simulation.
+    """
+    if not isinstance(state, Mapping):
+        raise InputError(f"the state must be a dictionary as of get_state_dict, not {type(state).__name__}.")
+    parts = (*KINDS, "controller")
+    if _has_usual_states(env) and (unknown := [name for name in state if name not in parts]):
+        raise InputError(f"the state has {unknown[0]!r}, which no state has: {suggestion(unknown[0], parts)}")
+    registry = {kind: getattr(env.scene.state_dict_registry, kind) for kind in KINDS}
+    for kind in KINDS:
+        if not isinstance(state.get(kind, {}), Mapping):
+            raise InputError(f"state[{kind!r}] must be a dictionary of rows by name, not {shown(state[kind])}.")
+    if not any(state.get(kind) for kind in KINDS) and any(registry.values()):
+        raise InputError("the state has nothing in 'actors' or 'articulations': give one as of get_state_dict.")
+    state = tensors(state, "state", env.device)
+    for kind, known in registry.items():
         for name, values in state.get(kind, {}).items():
             if name not in known:
                 raise InputError(f"the state has {kind} {name!r}, which the scene has not: {suggestion(name, known)}")
-            size = 13 if kind == "actors" else 13 + 2 * known[name].max_dof
-            everywhere = len(known[name]._objs) == env.num_envs
-            shape, what = (count if everywhere else len(values), size), f"state[{kind!r}][{name!r}]"
-            state[kind][name] = rows_of(values, *shape, what)[order if everywhere else ...]
+            size, what = 13 if kind == "actors" else 13 + 2 * known[name].max_dof, f"state[{kind!r}][{name!r}]"
+            if isinstance(values, dict):
+                raise InputError(f"{what} must be rows of {size} numbers, not a dictionary.")
+            rows = count if _is_everywhere(env, kind, name) else len(values) if values.ndim else 1
+            state[kind][name] = rows_of(values, rows, size, what)
             check_body(values, what)
-    if count:
-        original(env, state, *(() if rows is None else (rows,)))
+    return state
 
 
 def check_finite_state(state: Any, what: str) -> None:
@@ -263,12 +326,20 @@ def rows_of(values: Tensor, count: int, size: int, what: str) -> Tensor:
 def set_state(original: Callable, env: Any, state: Any, env_idx: Any = None) -> None:
     """ManiSkill's `set_state` with an array, lists or a tensor: a row as of `get_state` for each environment."""
     rows = None if env_idx is None else checked_rows(env_idx, env.num_envs, env.device)
-    flat = as_tensor(state, "state", env.device)
-    needed = sum(values.shape[-1] for kind in KINDS for values in env._init_raw_state[kind].values())
-    whole = env.get_state().shape[1]
+    original(env, _checked_flat(env, state, env.num_envs if rows is None else len(rows)), rows)
+
+
+def _checked_flat(env: Any, state: Any, count: int) -> Tensor:
+    """Rows as of `get_state`, or of the simulator alone, as a tensor with `count` rows.
+
+    Raises:
+        InputError: they have another shape, or are in no sound simulation.
+    """
+    flat = as_tensor(state, "the state", env.device)
+    widths = [values.shape[-1] for kind in KINDS for values in env._init_raw_state.get(kind, {}).values()]
+    needed, whole = sum(widths), env.get_state().shape[1]
     size = needed if flat.ndim and flat.shape[-1] == needed else whole
-    flat = rows_of(flat, env.num_envs if rows is None else len(rows), size, "the state")
-    widths = [values.shape[-1] for kind in KINDS for values in env._init_raw_state[kind].values()]
+    flat = rows_of(flat, count, size, "the state")
     for body in flat[:, :needed].split(widths, -1):
         check_body(body, "the state")
-    original(env, flat, rows)
+    return flat

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from dora.arguments import checked_rows, checked_seeds
 from dora.geometry.rotations import rotation_angle
-from dora.sim.batch.resets import START, checked_options
+from dora.sim.batch.resets import START, check_rebuilding, checked_options
+from dora.tasks.env.state import check_start
 
 SCALE_DRAW = 256
 """Which number of an environment's stream is its size [1]: episodes begin with the same numbers, and use fewer."""
@@ -26,7 +27,7 @@ def requested(env: Any, seed: Any, options: Any) -> tuple[int | list[int] | None
         options: as of `DoraEnv.reset`, or None.
 
     Raises:
-        InputError: as `dora.arguments.checked_seeds` and `dora.sim.batch.resets.checked_options`.
+        InputError: as `dora.arguments.checked_seeds`, `dora.sim.batch.resets.checked_options` and `check_start`.
     """
     given, options = options, checked_options(options, env.num_envs, env.device)
     rows = options.get("env_idx", range(env.num_envs))
@@ -34,6 +35,9 @@ def requested(env: Any, seed: Any, options: Any) -> tuple[int | list[int] | None
     if "env_idx" in options and isinstance(seeds, list) and len(seeds) == len(rows):
         order = checked_rows(given["env_idx"], env.num_envs).argsort().tolist()
         seeds = [seeds[k] for k in order]
+    check_rebuilding(env, options)
+    if START in options and len(rows) > 0:
+        check_start(env, options[START], options.get("env_idx", torch.arange(env.num_envs, device=env.device)))
     if len(rows) < env.num_envs:
         if seeds is not None and len(rows) > 0:
             _sow(env, options["env_idx"].tolist(), [seeds] if isinstance(seeds, int) else seeds)

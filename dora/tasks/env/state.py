@@ -10,8 +10,8 @@ from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from torch import Tensor
 
 from dora.arguments import as_tensor, checked_rows, taken, tensors
-from dora.errors import InputError
-from dora.sim.batch.resets import KINDS, check_body, check_finite_state, rows_of
+from dora.errors import InputError, suggestion
+from dora.sim.batch.resets import KINDS, STATES, check_body, check_finite_state, check_fits, rows_of
 
 RANGES = {"mass": (1e-9, 1e9), "friction": (0.0, 1e9), "scale": (1e-3, 1e3), "elapsed": (0.0, 1e9)}
 """Ranges of numbers of "task" and "memory" in a state, by the last word of their name: masses [kg], friction [1],
@@ -42,6 +42,9 @@ def checked_state(env: Any, state: Any, rows: Tensor) -> dict[str, Any]:
     """
     if not isinstance(state, Mapping):
         raise InputError(f"the state must be a dictionary as of get_state_dict, not {type(state).__name__}.")
+    known = (*KINDS, "controller", "task", *remembered(env))
+    if unknown := [name for name in state if name not in known]:
+        raise InputError(f"the state has {unknown[0]!r}, which this task has not: {suggestion(unknown[0], known)}")
     needed = [*KINDS, *(["task", *remembered(env)] if "task" in state else [])]
     given = {name: state[name] for name in (*needed, "controller") if name in state}
     if lacking := [name for name in needed if name not in given]:
@@ -51,6 +54,23 @@ def checked_state(env: Any, state: Any, rows: Tensor) -> dict[str, Any]:
     fitted = _fitted(tensors(given, "state", env.device), env._init_raw_state, len(rows), "state")
     _check(env, fitted)
     return fitted
+
+
+def check_start(env: Any, start: Mapping[str, Any], rows: Tensor) -> None:
+    """Refuse states and observations to begin in before anything is set.
+
+    Args:
+        env: the environment.
+        start: the states and perhaps an observation, as of `dora.sim.batch.resets.checked_options`.
+        rows: environments (b,) that begin in them.
+
+    Raises:
+        InputError: as `checked_state` and `dora.sim.batch.resets.check_fits`.
+    """
+    states = start[STATES]
+    checked_state(env, states if isinstance(states, dict) else unflattened(env, states, rows), rows)
+    if "obs" in start:
+        check_fits(start["obs"], env._last_obs, len(rows), "obs")
 
 
 def _check(env: Any, state: dict[str, Any]) -> None:
@@ -74,6 +94,8 @@ def _check(env: Any, state: dict[str, Any]) -> None:
 
 def _fitted(state: dict[str, Any], like: Mapping[str, Any], count: int, what: str) -> dict[str, Any]:
     out = {}
+    if unknown := [name for name in state if name not in like]:
+        raise InputError(f"{what} has {unknown[0]!r}, which is not known here: {suggestion(unknown[0], like)}")
     for name, part in like.items():
         path = f"{what}[{name!r}]"
         if name not in state:
@@ -83,6 +105,8 @@ def _fitted(state: dict[str, Any], like: Mapping[str, Any], count: int, what: st
             if not isinstance(state[name], dict):
                 raise InputError(f"{path} must be a dictionary with {', '.join(part)}.")
             out[name] = _fitted(state[name], part, count, path)
+        elif isinstance(state[name], dict):
+            raise InputError(f"{path} must be rows of numbers, not a dictionary.")
         else:
             out[name] = _rows(state[name], part, count, path)
     return out
