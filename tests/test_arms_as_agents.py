@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from dora.errors import InputError
 from dora.tasks.mdp.observations import columns_by_arm
@@ -168,11 +169,16 @@ def test_what_does_not_fit_is_refused_in_one_sentence():
     env.reset(seed=0)
     for actions, words in (
         ({}, "agents are"),
+        (None, "must be a dictionary"),
+        ({"arm": [], 3: []}, "agents are"),
+        ({"arm": [[0.0], [0.0, 1.0]]}, "rows of different lengths"),
+        ({"arm": "left"}, "must be numbers"),
         ({"arm": [0.0]}, "needs \\(26,\\)"),
         ({"arm": [float("nan")] * 26}, "NaN"),
     ):
         with pytest.raises(InputError, match=words):
             env.step(actions)
+    env.step({"arm": torch.zeros(26, requires_grad=True)})
     env.close()
 
 

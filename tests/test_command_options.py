@@ -5,6 +5,7 @@ import re
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import pytest
@@ -17,6 +18,8 @@ from dora.tools.demonstrations import record_demonstrations
 
 RUN = "--env DoraCube-v1 --workers 0"
 RESULTS = Path(__file__).parents[1] / "results" / "tasks" / "DoraCube-v1" / "ppo-affordance-s10"
+JUG = Path(__file__).parents[1] / "objects" / "jug" / "grasps.safetensors"
+EVALUATION = f"--eval-only --checkpoint {RESULTS}/policy.safetensors"
 HUGE = "1" + "0" * 30
 NUMBERS = {
     "seed": ("-1", HUGE), "total-steps": ("0", "-5", HUGE), "num-envs": ("0", HUGE), "workers": ("-1", HUGE),
@@ -84,6 +87,12 @@ def test_transitions_of_an_iteration_are_bounded():
         (f"{RUN} --stop-success 2", "--stop-success is 2.0 and has to be from 0 to 1"),
         ("--evn DoraCube-v1", "add --env instead of --evn"),
         ("--env DoraCub-v1", "did you mean 'DoraCube-v1'"),
+        (f"{EVALUATION} --num-envs 7", "--num-envs has no effect on an evaluation"),
+        (f"{EVALUATION} --learner-threads 7", "--learner-threads has no effect on an evaluation"),
+        (f"{EVALUATION} --collector ray", "--collector has no effect on an evaluation"),
+        (f"{RUN} --learner.learning-rate-min 1e-2", "--learner.learning-rate-min is 0.01 and"),
+        (f"{RUN} --learner.log-std -4", "--learner.log-std-min is -3.0 and --learner.log-std -4.0: the first"),
+        (f"{RUN} --agent sac --learner.capacity 1", "--learner.capacity is 1, and an iteration"),
         (f"{RUN} --preset standrd", "did you mean 'standard'"),
         (f"{RUN} --agent sacc", "use --agent with one of"),
         ("--resume x --out y", "--out does not go with --resume"),
@@ -151,6 +160,16 @@ def test_searches(words: str, message: str, monkeypatch: pytest.MonkeyPatch, cap
         ("view", "jug --port 0", "--port is 0"),
         ("view", "x.stl --scale nan", "--scale is nan"),
         ("view", "jug --scale 2", "belong to a mesh"),
+        ("view", "jug --mesh x.stl", "--mesh belongs to a file of grasps"),
+        ("view", f"{JUG} --units mm --scale 3", "belong to --mesh"),
+        ("view", f"{JUG} --labels nope.yaml", "belong to --mesh"),
+        ("view", "--pictures /proc/nope --mesh x.stl", "--mesh has no effect"),
+        ("view", "--pictures /proc/nope --labels x.yaml", "--labels has no effect"),
+        ("view", "--pictures /proc/nope --units mm", "--units has no effect"),
+        ("play", "DoraCube-v1 --video film.xyz", "let it end in one of .mp4"),
+        ("play", "DoraCube-v1 --video film", "let it end in one of .mp4"),
+        ("play", "DoraCube-v1 --episodes 3", "give --video"),
+        ("sweep", "--address ray://x:1 --dry-run", "add --launcher ray"),
         ("view", "jug --host nowhere.invalid", "--host is 'nowhere.invalid'"),
         ("view", "jug --host 192.0.2.1", "--host is '192.0.2.1', which is no address of this machine"),
         ("view", "jug --pictures /proc/nope", "Cannot make the folder"),
@@ -186,6 +205,10 @@ def test_other_commands(
     command: str, words: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     body = load_command(command)
+    if command == "view":
+        monkeypatch.setattr(body, "threading", SimpleNamespace(Event=lambda: pytest.fail("the page is there")))
+    if command == "play":
+        monkeypatch.setattr(body, "find_players", lambda args: pytest.fail("work has begun"))
     if command == "bench":
         monkeypatch.setattr(sys, "argv", ["bench", *words.split()])
         assert body.main() == 2

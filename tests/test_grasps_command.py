@@ -62,6 +62,14 @@ def script() -> ModuleType:
         ("--contact-maps --object spoon", "no object 'spoon'"),
         ("--rank-in-task --mesh a.stl", "need --object"),
         ("--make-bundle --object cube --kinematics pytorch_kinematics", "is for searches, not for --make-bundle"),
+        ("--make-bundle --object cube --num 8", "--num 8 is for searches"),
+        ("--make-bundle --object cube --out a.safetensors", "--out a.safetensors is for searches"),
+        ("--make-bundle --object cube --labels a.yaml", "--labels a.yaml is for searches"),
+        ("--make-bundle --object cube --mass 2", "--mass 2.0 is for searches"),
+        ("--make-bundle --object cube --validate sapien", "--validate sapien is for searches"),
+        ("--rank-in-task --object cube --seed 3", "--seed 3 is for searches"),
+        ("--contact-maps --object cube --any-region", "--any-region True is for searches"),
+        ("--object cube --any-region", "a search takes --region any"),
         ("--rank-in-task --object spoon", "no object 'spoon'"),
         ("--rank-in-task --any-region --object microwave", "DoraMicrowave-v1 has several arms"),
     ],
@@ -73,6 +81,9 @@ def test_bad_input(
     arguments: str,
     words: str,
 ):
+    for work in ("generate", "make_bundle", "rank_bundled_set", "map_bundled_set"):
+        if "cube" in arguments:
+            monkeypatch.setattr(script, work, lambda *_, **__: pytest.fail("work has begun"))
     assert words in refusal(script, monkeypatch, capsys, arguments)
 
 

@@ -10,7 +10,7 @@ iteration), and writes OUT (safetensors) and a .json beside it. `dora view OUT` 
 
 import sys
 import unicodedata
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -46,6 +46,8 @@ RANGES = {
     "scale": (1e-9, 1e9),
 }
 """Lowest and highest value of options."""
+TAKEN = {"make_bundle": ("seed", "seat", "any_region"), "rank_in_task": ("any_region",), "contact_maps": ()}
+"""What takes no options of searches, and the options that it does take beside --object."""
 ANY = "any"
 """Value of --region for a search without a region."""
 
@@ -156,6 +158,8 @@ def region_of(obj: AffordanceObject, region: str) -> str | None:
 
 def run(args: Args) -> None:
     """Generate, print and write."""
+    if args.any_region:
+        raise InputError("--any-region goes with --make-bundle or --rank-in-task: a search takes --region any.")
     wanted = described_target(args)
     obj, region = wanted.obj, wanted.region
     robot = load_robot(args.robot)
@@ -201,8 +205,14 @@ def remake(args: Args) -> None:
         raise InputError(
             "--make-bundle, --rank-in-task and --contact-maps need --object, for example --object jug, and no --mesh."
         )
-    if args.kinematics != "compiled":
-        raise InputError(f"--kinematics {args.kinematics} is for searches, not for --make-bundle or --rank-in-task.")
+    used = TAKEN["make_bundle" if args.make_bundle else "rank_in_task" if args.rank_in_task else "contact_maps"]
+    for field in fields(args):
+        if field.name not in ("object", *TAKEN, *used) and (value := getattr(args, field.name)) != field.default:
+            option = f"--{field.name.replace('_', '-')}"
+            raise InputError(
+                f"{option} {value} is for searches, not for --make-bundle, --rank-in-task or --contact-maps: "
+                "leave it out."
+            )
     name = args.object
     if args.contact_maps and not (args.make_bundle or args.rank_in_task):
         path, agreement = map_bundled_set(name)

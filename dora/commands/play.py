@@ -20,7 +20,7 @@ from typing import Annotated, Literal
 import torch
 import tyro
 
-from dora.agents.evaluation.play import record
+from dora.agents.evaluation.play import check_film, record
 from dora.arguments import LARGEST_SEED
 from dora.configs import check_ranges
 from dora.errors import InputError, command
@@ -159,6 +159,10 @@ def main() -> int:
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     torch.set_num_threads(1)
     check_ranges(args, RANGES, lambda name: f"--{name}")
+    if args.video is not None:
+        check_film(args.video)
+    elif args.episodes != Args.episodes:
+        raise InputError("--episodes is the length of a film: give --video with it, or leave it out.")
     check_task_id(args.env)
     players = find_players(args)
     if args.video is not None:

@@ -106,6 +106,8 @@ def _check(args: Args) -> None:
         smallest = least.get(option, 1)
         if value is not None and value < smallest:
             raise InputError(f"{option} is {value}, but has to be at least {smallest}.")
+    if args.launcher == "local" and args.address is not None:
+        raise InputError("--address is that of a Ray cluster: add --launcher ray, or leave it out.")
     for seed in args.seeds:
         if seed < 0:
             raise InputError(f"--seeds has {seed}, but a seed has to be at least 0.")

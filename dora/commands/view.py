@@ -13,6 +13,7 @@ Runs until Ctrl-C.
 
 import os
 import threading
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -33,6 +34,8 @@ from dora.tables import show_any_script
 
 RANGES = {"port": (1, 65_535), "scale": (1e-9, 1e9)}
 """Lowest and highest value of options."""
+FOR_MESHES = ("labels", "scale", "units")
+"""Options for a mesh file."""
 GRASPS = ".safetensors"
 """Suffix of a file of grasps."""
 
@@ -63,6 +66,11 @@ class Args:
     """Robot whose hand is shown: a folder name in robots/ or a path."""
 
 
+def changed(args: Args, names: Iterable[str]) -> list[str]:
+    """Which of some options have another value than if they are left out."""
+    return [name for name in names if getattr(args, name) != getattr(Args, name)]
+
+
 def content(args: Args) -> tuple[AffordanceObject, GraspCandidates | None]:
     """The object to show and its grasps, if there are any."""
     robot = load_robot(args.robot)
@@ -70,11 +78,15 @@ def content(args: Args) -> tuple[AffordanceObject, GraspCandidates | None]:
         raise InputError("Say what to show: an object, a file of grasps or a mesh file, for example jug.")
     path = Path(args.source)
     if path.suffix != GRASPS or args.source in available_objects():
+        if args.mesh is not None:
+            raise InputError(f"--mesh belongs to a file of grasps ({GRASPS}), and {args.source} is none: leave it out.")
         return with_bundle(opened(args, args.source), robot)
     name = GraspCandidates.load(path).object
     if args.mesh is not None:
         obj = opened(args, str(args.mesh))
     elif name in available_objects():
+        if changed(args, FOR_MESHES):
+            raise InputError(f"--labels, --scale and --units belong to --mesh: give it with {path}, or leave them out.")
         obj = load_object(name)
     else:
         raise InputError(f"{path} holds grasps of {name!r}: give its mesh with --mesh, and --labels if it has any.")
@@ -85,7 +97,7 @@ def opened(args: Args, source: str) -> AffordanceObject:
     """An object by its name or folder, or from a mesh file with the options for meshes."""
     if os.path.isfile(source) and source not in available_objects():
         return import_object(source, labels=args.labels, scale=args.scale, units=args.units)
-    if args.labels is not None or args.scale != 1 or args.units != "m":
+    if changed(args, FOR_MESHES):
         raise InputError(f"--labels, --scale and --units belong to a mesh, and {source} is none: leave them out.")
     return load_object(source)
 
@@ -104,6 +116,8 @@ def main() -> int:
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=description)
     check_ranges(args, RANGES, lambda name: f"--{name}")
     if args.source is None and args.pictures is not None:
+        if given := changed(args, (*FOR_MESHES, "mesh", "robot")):
+            raise InputError(f"--{given[0]} has no effect on a picture of all objects: name one, or leave it out.")
         print(write_objects(args.pictures))
         return 0
     obj, candidates = content(args)

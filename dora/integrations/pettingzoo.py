@@ -6,6 +6,7 @@ env = make("DoraMicrowave-v1")  # agents "left" and "right"
 observations, infos = env.reset(seed=0)
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +15,7 @@ from gymnasium.spaces import Box
 from pettingzoo import ParallelEnv
 from torch import Tensor
 
+from dora.arguments import as_array, as_tensor
 from dora.errors import InputError, shown
 from dora.integrations.batches import make_batch
 
@@ -82,9 +84,12 @@ class ArmsEnv(ParallelEnv):
         return self._observed(obs), self._each(_info(info))
 
     def step(
-        self, actions: dict[str, Any]
+        self, actions: Any
     ) -> tuple[Observations, dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """One control step with the action of each agent.
+
+        Args:
+            actions: numbers by agent, in any form that `dora.arguments.as_tensor` takes.
 
         Returns:
             Observations, rewards, terminations, truncations and infos by agent.
@@ -92,11 +97,13 @@ class ArmsEnv(ParallelEnv):
         Raises:
             InputError: the actions are not those of the agents, or have another shape, or hold NaN or infinity.
         """
+        if not isinstance(actions, Mapping):
+            raise InputError(f"The actions must be a dictionary by agent, {self.agents} here, not {shown(actions)}.")
         if set(actions) != set(self.agents):
-            raise InputError(f"There are actions for {shown(sorted(actions))}, and the agents are {self.agents}.")
+            raise InputError(f"There are actions for {shown(list(actions))}, and the agents are {self.agents}.")
         joint = np.zeros(self._size, np.float32)
         for name in self.agents:
-            own, columns = np.asarray(actions[name], np.float32), self._columns[name][1]
+            own, columns = as_array(as_tensor(actions[name], f"The action of {name}")), self._columns[name][1]
             if own.shape != (len(columns),):
                 raise InputError(f"The action of {name} has the shape {own.shape} and needs ({len(columns)},).")
             joint[columns] = own

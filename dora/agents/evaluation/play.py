@@ -19,7 +19,10 @@ from dora.agents.evaluation.evaluate import FINAL_SEED, Act, Evaluation, no_corr
 from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.learner import agents_of, make_learner
 from dora.agents.learners.networks import Policy
+from dora.errors import InputError
 
+FILMS = (".mp4", ".mov", ".avi", ".mkv", ".wmv", ".gif")
+"""Suffixes of films that can be written."""
 FRAMES_PER_SECOND = 20
 """Rate of a film of a task that does not say its control frequency [Hz]."""
 
@@ -85,6 +88,18 @@ def evaluate_zero(config: RunConfig, make_task: MakeTask, first_seed: int = FINA
         evaluators.close()
 
 
+def check_film(path: Path) -> None:
+    """Refuse the path of a film that could not be written.
+
+    Raises:
+        InputError: it has another suffix than `FILMS`, or is a folder.
+    """
+    if path.suffix.lower() not in FILMS:
+        raise InputError(f"{path} is no name of a film: let it end in one of {', '.join(FILMS)}.")
+    if os.path.isdir(path):
+        raise InputError(f"{path} is a folder: name a file for the film.")
+
+
 def record(
     make_task: Callable[[], Task], act: Act | None, path: Path, episodes: int, first_seed: int = FINAL_SEED
 ) -> None:
@@ -98,8 +113,10 @@ def record(
         first_seed: seed of the first one; those of the others follow.
 
     Raises:
+        InputError: as `check_film`.
         RuntimeError: if nothing can be rendered, for want of a driver.
     """
+    check_film(path)
     task: Any = make_task()
     try:
         act = act or no_correction(len(task.single_action_space.low))
