@@ -1,5 +1,6 @@
 """Fixtures of the whole suite; one thread, because tests measure nothing and batches are small."""
 
+import gc
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -18,6 +19,14 @@ LONG = (
 
 def pytest_collection_modifyitems(items: list[pytest.Item]):
     items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_collections():
+    """What is alive before a module stays alive: out of the collector's sight a collection, of which every new scene
+    takes three, is ten times quicker."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -127,6 +127,7 @@ def film(args: Args, player: Player) -> Path:
 @contextlib.contextmanager
 def served(session: Session, port: int, host: str) -> Iterator[Page]:
     """A page of a session, both running; they end with the context."""
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # a client that goes away would bring a traceback
     page = Page(session, port, host)
     session.start()
     page.start()

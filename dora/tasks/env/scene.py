@@ -200,7 +200,7 @@ def freeing_the_old_scene(env: Any) -> Iterator[None]:
     try:
         yield
     finally:
-        if id(vars(env).get("scene")) != before:
+        if before != id(None) and id(vars(env).get("scene")) != before:
             gc.collect()
 
 
