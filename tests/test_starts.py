@@ -16,6 +16,7 @@ from test_report import write_run
 import dora  # noqa: F401  (registers the tasks)
 from dora.agents.collecting.task_env import TaskEnv
 from dora.agents.evaluation.evaluate import Evaluation, run_batch
+from dora.agents.reports import report
 from dora.agents.reports.report import write_report
 from dora.agents.reports.run_results import find_runs
 from dora.agents.reports.starts import bins, starts_section
@@ -168,3 +169,20 @@ def test_an_empty_table_of_episodes_and_endless_names_are_refused(content: str, 
     with pytest.raises(InputError, match=words):
         write_report(tmp_path / "runs", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_report_that_cannot_be_drawn_replaces_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write_run(tmp_path / "runs" / "0", 0, 0.5)
+    columns = [",".join([str(i), str(i % 2), str(i)]) for i in range(8)]
+    (tmp_path / "runs" / "0" / "eval.csv").write_text("\n".join(["episode,success,start/a", *columns]) + "\n")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "tables.md").write_text("those of before")
+
+    def interrupted(*_: Any) -> bytes:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "draw_starts", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_report(tmp_path / "runs", tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["tables.md"]
+    assert (tmp_path / "out" / "tables.md").read_text() == "those of before"

@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Sequence
-from pathlib import Path
 from statistics import mean
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 
 from dora.agents.reports.run_results import Group, Run, grouped, zero_episodes, zero_shares
-from dora.files import write_bytes
 
 COLOURS = {
     ("PPO", "affordance"): "#c0392b",
@@ -63,10 +61,10 @@ def smoothed(
     return found
 
 
-def draw_curves(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
-    """Success and return of greedy evaluations over environment steps and minutes, one line per learner: mean and range
-    over seeds; dotted, the success of no correction in the last evaluations. Below, where runs have a `progress.csv`,
-    what happened in training, smoothed as in the paper, before the raw values."""
+def draw_curves(runs: Sequence[Run], env: str, preset: str) -> bytes:
+    """A PNG of success and return of greedy evaluations over environment steps and minutes, one line per learner: mean
+    and range over seeds; dotted, the success of no correction in the last evaluations. Below, where runs have a
+    `progress.csv`, what happened in training, smoothed as in the paper, before the raw values."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -91,12 +89,12 @@ def draw_curves(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110)
     pyplot.close(figure)
-    write_bytes(path, content.getvalue())
+    return content.getvalue()
 
 
-def draw_overlap(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
-    """Share of evaluation episodes whose largest overlap stays below a depth, one line per learner and guidance, over
-    the episodes of all its seeds; dotted, zero correction."""
+def draw_overlap(runs: Sequence[Run], env: str, preset: str) -> bytes:
+    """A PNG of the share of evaluation episodes whose largest overlap stays below a depth, one line per learner and
+    guidance, over the episodes of all its seeds; dotted, zero correction."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -130,7 +128,7 @@ def draw_overlap(runs: Sequence[Run], env: str, preset: str, path: Path) -> None
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110)
     pyplot.close(figure)
-    write_bytes(path, content.getvalue())
+    return content.getvalue()
 
 
 def shortened(name: str) -> str:

@@ -133,25 +133,27 @@ def write_report(root: Path, out: Path) -> list[Path]:
         InputError: there is no finished run, a file of one is damaged, or `out` cannot be written.
     """
     runs = find_runs(root)
-    make_folder(out)
-    write_bytes(out / "tables.md", f"{tables(runs)}\n{NOTE}\n".encode())
-    began, figures = starts_section(runs), list[Path]()
+    began, figures = starts_section(runs), dict[str, bytes]()
     compared = [*sections(runs), *([began] if began.rows else [])]
-    write_bytes(out / "comparison.md", "\n".join(map(_markdown, compared)).encode())
     for env, preset in sorted({run.group[:2] for run in runs if run.curve or run.progress}):
         name = env if preset == DEFAULT_PRESET else f"{env}-{preset}"
-        figures.append(out / f"{file_name(name)}.png")
-        draw_curves(runs, env, preset, figures[-1])
+        figures[f"{file_name(name)}.png"] = draw_curves(runs, env, preset)
         if any(run.group[:2] == (env, preset) and OVERLAP in run.episodes for run in runs):
-            figures.append(out / f"{file_name(name)}-overlap.png")
-            draw_overlap(runs, env, preset, figures[-1])
+            figures[f"{file_name(name)}-overlap.png"] = draw_overlap(runs, env, preset)
         if has_starts(runs, env, preset):
-            figures.append(out / f"{file_name(name)}-starts.png")
-            draw_starts(runs, env, preset, figures[-1])
-    pictures = [(path.name, base64.b64encode(path.read_bytes()).decode()) for path in figures]
+            figures[f"{file_name(name)}-starts.png"] = draw_starts(runs, env, preset)
+    pictures = [(name, base64.b64encode(content).decode()) for name, content in figures.items()]
     shown = {"head": HEADINGS, "rows": table_rows(runs), "note": NOTE, "figures": pictures, "sections": compared}
-    write_bytes(out / "report.html", html_page(PAGE, root=root.name, **shown).encode())
-    return [out / "tables.md", out / "comparison.md", out / "report.html", *figures]
+    texts = {
+        "tables.md": f"{tables(runs)}\n{NOTE}\n",
+        "comparison.md": "\n".join(map(_markdown, compared)),
+        "report.html": html_page(PAGE, root=root.name, **shown),
+    }
+    contents = {name: text.encode() for name, text in texts.items()} | figures
+    make_folder(out)  # everything has been read and drawn
+    for name, content in contents.items():
+        write_bytes(out / name, content)
+    return [out / name for name in contents]
 
 
 def _markdown(section: Section) -> str:

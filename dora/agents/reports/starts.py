@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +9,6 @@ from jaxtyping import Float
 from dora.agents.reports.comparison import Section
 from dora.agents.reports.figures import COLOURS, shortened
 from dora.agents.reports.run_results import Run, grouped, zero_episodes
-from dora.files import write_bytes
 from dora.tables import wilson
 
 PREFIX = "start/"
@@ -71,9 +69,9 @@ def has_starts(runs: Sequence[Run], env: str, preset: str) -> bool:
     return any(run.group[:2] == (env, preset) and any(map(_is_start, run.episodes)) for run in runs)
 
 
-def draw_starts(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
-    """Success over each number of the start, one line per learner and guidance with Wilson's intervals of each quarter
-    of its episodes; dotted, zero correction."""
+def draw_starts(runs: Sequence[Run], env: str, preset: str) -> bytes:
+    """A PNG of success over each number of the start, the first `MOST_DRAWN` of them, one line per learner and guidance
+    with Wilson's intervals of each quarter of its episodes; dotted, zero correction."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -86,7 +84,7 @@ def draw_starts(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
         for tables, style in (([m.episodes for m in members], "-"), (zero_episodes(members), ":"))
     ]
     names = list(dict.fromkeys(n for episodes, *_ in lines for n in filter(_is_start, episodes) if bins(episodes, n)))
-    names = names[:MOST_DRAWN]
+    count, names = len(names), names[:MOST_DRAWN]
     down = -(-max(len(names), 1) // ACROSS)
     figure, axes = pyplot.subplots(
         down, ACROSS, figsize=(13, 0.8 + 3.2 * down), layout="constrained", squeeze=False, sharey=True
@@ -114,8 +112,9 @@ def draw_starts(runs: Sequence[Run], env: str, preset: str, path: Path) -> None:
     for text in figure.legend(handles, labels, fontsize=8, loc="outside lower center", ncols=2).get_texts():
         text.set_parse_math(False)
     title = f"{shortened(env)}, preset {shortened(preset)}: success in quarters of the episodes"
+    title += f" (the first {MOST_DRAWN} of {count} numbers)" if count > MOST_DRAWN else ""
     figure.suptitle(title).set_parse_math(False)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110)
     pyplot.close(figure)
-    write_bytes(path, content.getvalue())
+    return content.getvalue()

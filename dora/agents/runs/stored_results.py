@@ -124,7 +124,8 @@ def read_episodes(path: Path) -> dict[str, list[float]]:
     """Columns of an eval.csv or a zero.csv, a value for each episode.
 
     Raises:
-        InputError: it is too large, no table, lacks a column, or has a cell that is no number or a success but 0 or 1.
+        InputError: it is too large, no table, has no row, lacks a column, or has a cell that is no number or a success
+            but 0 or 1.
     """
     columns = _read_table(path, EPISODE_COLUMNS, MOST_EPISODES, all_columns=True)
     if not columns["success"]:
