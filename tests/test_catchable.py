@@ -12,7 +12,7 @@ from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply
 from dora.robot import load_robot
 from dora.tasks.hammer.reach import REACH, TURN, with_waiting_hand, within_reach
-from dora.tools.task_ranking import usable_in_task
+from dora.tools.in_task.ranking import usable_in_task
 
 HOME_P, HOME_Q = torch.tensor([[0.35, -0.2, 0.6]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
 OBJECT_Q = torch.tensor([[1.0, 0.0, 0.0, 0.0]])

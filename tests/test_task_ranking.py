@@ -14,7 +14,7 @@ from dora.affordance.reach.feasibility_table import file_name
 from dora.errors import InputError
 from dora.tasks import make_task
 from dora.tasks.cube import hand_made_candidates
-from dora.tools.task_ranking import (
+from dora.tools.in_task.ranking import (
     TaskRanking,
     _as_mapping,
     _Balanced,

@@ -34,7 +34,8 @@ from dora.sim.grasp_tests.failures import hint
 from dora.sim.grasp_tests.generation import baselines, by_region, generate, summary, voting_summary
 from dora.sim.grasp_tests.report import check_out, print_agreement, print_report, write_report
 from dora.tables import show_any_script
-from dora.tools.task_ranking import rank_bundled_set, tasks_of, usable_in_task
+from dora.tools.in_task.ranking import rank_bundled_set, tasks_of, usable_in_task
+from dora.tools.in_task.refining import refine_bundled_set
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
@@ -46,7 +47,12 @@ RANGES = {
     "scale": (1e-9, 1e9),
 }
 """Lowest and highest value of options."""
-TAKEN = {"make_bundle": ("seed", "seat", "any_region"), "rank_in_task": ("any_region",), "contact_maps": ()}
+TAKEN = {
+    "make_bundle": ("seed", "seat", "any_region"),
+    "rank_in_task": ("any_region",),
+    "refine_in_task": ("any_region",),
+    "contact_maps": (),
+}
 """What takes no options of searches, and the options that it does take beside --object."""
 ANY = "any"
 """Value of --region for a search without a region."""
@@ -98,9 +104,13 @@ class Args:
     """Make the bundled set of --object instead, grasps.safetensors in its folder: enough valid grasps, ranked by
     simulated lifts or holds; then what --rank-in-task does, where a task uses the object."""
     any_region: bool = False
-    """With --make-bundle or --rank-in-task: the set of a search that knows no region, which guidance "grasps" uses."""
+    """With --make-bundle, --rank-in-task or --refine-in-task: the set of a search that knows no region, which guidance
+    "grasps" uses."""
     rank_in_task: bool = False
     """Execute the bundled set of --object in the task that uses it, and rank it by the episodes that succeed."""
+    refine_in_task: bool = False
+    """Search near the best grasps of the bundled set of --object, execute what is found in the task, and keep the
+    best."""
     contact_maps: bool = False
     """Make the contact semantic maps of the bundled set of --object anew, and print what they vote for."""
 
@@ -159,7 +169,8 @@ def region_of(obj: AffordanceObject, region: str) -> str | None:
 def run(args: Args) -> None:
     """Generate, print and write."""
     if args.any_region:
-        raise InputError("--any-region goes with --make-bundle or --rank-in-task: a search takes --region any.")
+        which = "--make-bundle, --rank-in-task or --refine-in-task"
+        raise InputError(f"--any-region goes with {which}: a search takes --region any.")
     wanted = described_target(args)
     obj, region = wanted.obj, wanted.region
     robot = load_robot(args.robot)
@@ -200,21 +211,17 @@ def about(wanted: Target) -> dict[str, Any]:
 
 
 def remake(args: Args) -> None:
-    """Make or rank the bundled set of an object, or make its contact maps anew."""
+    """Make, rank or refine the bundled set of an object, or make its contact maps anew."""
+    asked = [f"--{name.replace('_', '-')}" for name in TAKEN]
     if args.object is None or args.mesh is not None:
-        raise InputError(
-            "--make-bundle, --rank-in-task and --contact-maps need --object, for example --object jug, and no --mesh."
-        )
-    used = TAKEN["make_bundle" if args.make_bundle else "rank_in_task" if args.rank_in_task else "contact_maps"]
+        raise InputError(f"{', '.join(asked)} need --object, for example --object jug, and no --mesh.")
+    used = TAKEN[next(name for name in TAKEN if getattr(args, name))]
     for field in fields(args):
         if field.name not in ("object", *TAKEN, *used) and (value := getattr(args, field.name)) != field.default:
             option = f"--{field.name.replace('_', '-')}"
-            raise InputError(
-                f"{option} {value} is for searches, not for --make-bundle, --rank-in-task or --contact-maps: "
-                "leave it out."
-            )
+            raise InputError(f"{option} {value} is for searches, not for {', '.join(asked)}: leave it out.")
     name = args.object
-    if args.contact_maps and not (args.make_bundle or args.rank_in_task):
+    if args.contact_maps and not (args.make_bundle or args.rank_in_task or args.refine_in_task):
         path, agreement = map_bundled_set(name)
         print_agreement(agreement)
         print(path)
@@ -224,9 +231,11 @@ def remake(args: Args) -> None:
         if args.make_bundle:
             usable, settings = usable_in_task(name), Settings(seat=args.seat)
             print(make_bundle(name, args.seed, phases, usable, not args.any_region, settings))
-        if args.rank_in_task or ids:
+        if args.rank_in_task or (args.make_bundle and ids):
             paths = rank_bundled_set(name, lambda title: phases.phase(title, "episodes"), not args.any_region)
             print("\n".join(map(str, paths)))
+        if args.refine_in_task:
+            print("\n".join(map(str, refine_bundled_set(name, phases, not args.any_region))))
 
 
 @command
@@ -237,7 +246,7 @@ def main() -> int:
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=description)
     try:
         check_ranges(args, RANGES, lambda name: f"--{name.replace('_', '-')}")
-        if args.make_bundle or args.rank_in_task or args.contact_maps:
+        if any(getattr(args, name) for name in TAKEN):
             remake(args)
         else:
             run(args)

@@ -1,4 +1,5 @@
-"""Initial hand poses: the open palm in front of a surface point, the fingers across the part to be held."""
+"""Initial hand poses: the open palm in front of a surface point, the fingers across the part to be held; or near those
+of given candidates."""
 
 from __future__ import annotations
 
@@ -10,8 +11,10 @@ import trimesh
 from jaxtyping import Float
 from torch import Tensor
 
+from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.objects.affordance_object import AffordanceObject
+from dora.geometry.rotations import matrix_from_quaternion, matrix_from_rotation_vector
 
 SAMPLES = 2048
 """Number of surface points from which initial poses are drawn."""
@@ -38,6 +41,21 @@ class Spread:
     roll: float = 0.2
     abduction: float = 0.08
     flexion: tuple[float, float] = (0.25, 0.1)
+
+
+@dataclass(frozen=True)
+class Nearness:
+    """Random spread of initial poses near given ones.
+
+    Attributes:
+        position: standard deviation of the wrist's position, per component [m].
+        rotation: standard deviation of its rotation vector, per component [rad].
+        joint: standard deviation of each actuated joint [rad].
+    """
+
+    position: float = 0.005
+    rotation: float = 0.08
+    joint: float = 0.05
 
 
 class InitialPoses:
@@ -97,6 +115,36 @@ class InitialPoses:
         zero_share = -hand.lower / width
         spreads = (zero_share > 0.25) & (zero_share < 0.75)
         return torch.clamp(torch.where(spreads, spread.abduction * noise, flexed), hand.lower, hand.upper)
+
+
+class PosesNear:
+    """Draws initial poses near those of candidates, of each about equally many.
+
+    Args:
+        candidates: grasps of the object and of the hand.
+        hand: the hand.
+        spread: random spread of the poses.
+    """
+
+    def __init__(self, candidates: GraspCandidates, hand: HandModel, spread: Nearness) -> None:
+        to_hand = {"dtype": hand.dtype, "device": hand.device}
+        self.hand, self.spread = hand, spread
+        self.position = candidates.position.to(**to_hand)
+        self.rotation = matrix_from_quaternion(candidates.quaternion.to(**to_hand))
+        self.joints = hand.robot.reduce_hand(candidates.joints.to(**to_hand))
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "c 4 4"], Float[Tensor, "c a"]]:
+        """Wrist poses (c, 4, 4) in the object frame [m] and actuated joints (c, a) [rad]."""
+        chosen, new = torch.arange(count) % len(self.position), self.position
+
+        def normal(size: int) -> Tensor:
+            return torch.randn(count, size, generator=generator).to(new)
+
+        wrist = torch.eye(4, dtype=new.dtype, device=new.device).repeat(count, 1, 1)
+        wrist[:, :3, 3] = self.position[chosen] + self.spread.position * normal(3)
+        wrist[:, :3, :3] = matrix_from_rotation_vector(self.spread.rotation * normal(3)) @ self.rotation[chosen]
+        joints = self.joints[chosen] + self.spread.joint * normal(self.joints.shape[1])
+        return wrist, torch.clamp(joints, self.hand.lower, self.hand.upper)
 
 
 def unit(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:

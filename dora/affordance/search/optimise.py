@@ -18,10 +18,11 @@ from dora.affordance.maps.contact_semantic_map import contact_semantic_map, pres
 from dora.affordance.maps.voting import NO_CONTACT, vote
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.search.backends import check_kinematics, closing_model_of, described, energy_of
-from dora.affordance.search.cache import initial_of, map_of
+from dora.affordance.search.cache import hand_of, initial_of, map_of
 from dora.affordance.search.compiled import CompiledEnergy
 from dora.affordance.search.descent import Rows
 from dora.affordance.search.energies import GraspEnergy, Table
+from dora.affordance.search.initial_poses import Nearness, PosesNear
 from dora.affordance.search.penetration import Penetration, self_penetration
 from dora.affordance.search.quasi_static_closing import Steps, close_hand
 from dora.affordance.search.search import Search, Settings
@@ -57,6 +58,7 @@ def optimise(
     progress: Progress | None = None,
     kinematics: str = "compiled",
     extra_energies: ExtraEnergies | None = None,
+    near: GraspCandidates | None = None,
 ) -> GraspCandidates:
     """Search for grasps of an object.
 
@@ -73,6 +75,8 @@ def optimise(
             differentiation, which is slower and takes energies of yours.
         extra_energies: energies to be added to the terms: by name a constant weight, per unit of the energy, and a
             differentiable function of `GraspState` whose value is (c,).
+        near: candidates of this object and hand, near which the search begins (`Nearness`), instead of in front of the
+            region.
 
     Returns:
         `num` candidates in the object frame, best first. `valid` says whether the penetration depth at the candidate
@@ -80,7 +84,7 @@ def optimise(
 
     Raises:
         InputError: `num` is less than 1, the object has no such region or is too large for a hand, unknown kinematics,
-            or extra energies that cannot be used.
+            extra energies that cannot be used, or `near` is of another object or hand.
     """
     settings = settings or Settings()
     if num < 1:
@@ -91,7 +95,12 @@ def optimise(
     table = table_of(obj) if on_table else None
     energy = energy_of(kinematics, obj, robot, region, place, settings.weights, table, extra_energies)
     model = closing_model_of(energy, obj, robot, region)
-    search = Search(energy, initial_of(obj, robot, region, settings.spread, place), settings)
+    if near is None:
+        initial = initial_of(obj, robot, region, settings.spread, place)
+    else:
+        near.check_fits("the set near which is searched", obj, robot, stored=False)
+        initial = PosesNear(near, hand_of(robot, place), Nearness())
+    search = Search(energy, initial, settings)
     wanted = math.ceil(num * settings.oversampling)
     sizes = [min(settings.batch, wanted - start) for start in range(0, wanted, settings.batch)]
     done, total = 0, wanted * settings.iterations

@@ -20,7 +20,7 @@ from torch import Tensor
 from dora.affordance.search.backends import descent_of
 from dora.affordance.search.descent import Rows, Schedule
 from dora.affordance.search.energies import GraspEnergy, Weights
-from dora.affordance.search.initial_poses import InitialPoses, Spread
+from dora.affordance.search.initial_poses import InitialPoses, PosesNear, Spread
 from dora.errors import InputError
 
 MOST_SEATING = 2.0
@@ -111,7 +111,7 @@ class Search:
         settings: settings of the search.
     """
 
-    def __init__(self, energy: GraspEnergy, initial: InitialPoses, settings: Settings) -> None:
+    def __init__(self, energy: GraspEnergy, initial: InitialPoses | PosesNear, settings: Settings) -> None:
         self.energy, self.initial, self.settings = energy, initial, settings
         hand = energy.hand
         steps = [settings.translation] * 3 + [settings.rotation] * 3 + [settings.joint] * len(hand.lower)

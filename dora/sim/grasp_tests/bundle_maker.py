@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -41,6 +42,10 @@ PLACES = Grid((0.55, 0.0), (0.08, 0.08), spacing=0.08, yaws=12)
 """Places and yaws of objects on a table at which grasps are tested for reach."""
 FEASIBLE_SHARE = 0.03
 """Smallest share of those places at which a grasp must be feasible [1]."""
+MOST_NEAR = 6
+"""Largest number of rounds of a search near candidates."""
+SHORT: dict[str, Any] = {"iterations": 20, "starts": 1, "field_size": 1.0, "oversampling": 1.5}
+"""Settings of a search near candidates, which have converged already."""
 OTHERS = 64
 """Number of candidates searched for each other region."""
 OTHERS_KEPT = 32
@@ -135,16 +140,41 @@ class SetMaker:
             raise InputError(f"{name}: only {count} grasps of {where} are valid, {FEWEST_GRASPS} are needed; {why}.")
         return concatenate(sets).select(slice(POOL))
 
-    def valid(self, num: int, seed: int, label: str | None, usable: Usable | None = None) -> GraspCandidates | None:
+    def near(self, candidates: GraspCandidates, count: int, seed: int, label: str | None) -> GraspCandidates | None:
+        """Up to `count` further grasps near candidates, which hold `label` (None: anything); None if there are none."""
+        sets: list[GraspCandidates] = []
+        for index in range(MOST_NEAR):
+            found = self.valid(ROUND, seed + index, label, self.usable, candidates)
+            sets += [] if found is None else [found]
+            if sum(map(len, sets)) >= count:
+                break
+        return concatenate(sets).select(slice(count)) if sets else None
+
+    def valid(
+        self,
+        num: int,
+        seed: int,
+        label: str | None,
+        usable: Usable | None = None,
+        near: GraspCandidates | None = None,
+    ) -> GraspCandidates | None:
         """Those of `num` candidates that hold `label` (None: anything), are usable, have a free approach, and are
         strictly valid.
+
+        Args:
+            num: candidates that are searched for.
+            seed: of the search.
+            label: region that they hold; None for any.
+            usable: mask of those that the object's task can use.
+            near: candidates near which is searched, in fewer steps.
 
         Returns:
             The candidates; None if none is left.
         """
+        settings = self.settings if near is None else replace(self.settings, **SHORT)
         found = optimise(
-            self.obj, self.robot, num, seed, label, self.settings,
-            progress=self.phase(f"search {label or 'any region'}", 1 / self.settings.iterations),
+            self.obj, self.robot, num, seed, label, settings, near=near,
+            progress=self.phase(f"search {label or 'any region'}", 1 / settings.iterations),
         )  # fmt: skip
         good = found.valid & (found.self_penetration < STANDARD.strict_self_penetration)
         if label is not None:

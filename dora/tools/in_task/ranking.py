@@ -275,7 +275,7 @@ def rank_bundled_set(
         low = float(top.score.min())
         parts = [top] + ([replace(rest, score=rest.score.clamp(max=low))] if rest is not None else [])
         others = [found[arm].select(~wanted[arm])] if not wanted[arm].all() else []
-        settings = _as_mapping(found[arm].settings) | {"ranking_steps": first[arm].steps + again[arm].steps}
+        settings = as_mapping(found[arm].settings) | {"ranking_steps": first[arm].steps + again[arm].steps}
         own = None if tasks_of(one)[:1] in ([], [ids[0]]) else ids[0]
         written.append(bundled_path(name if one is obj else one.name, region, own))
         replace(concatenate([*parts, *others]), settings=json.dumps(settings)).save(written[-1])
@@ -288,7 +288,7 @@ def _most(sets: Mapping[str, GraspCandidates]) -> int:
     return max(map(len, sets.values()))
 
 
-def _as_mapping(settings: str) -> dict[str, Any]:
+def as_mapping(settings: str) -> dict[str, Any]:
     """Settings of candidates by name; those of early files are the search's alone."""
     try:
         made = parse_json(settings or "{}", "the settings of the grasps")
