@@ -68,6 +68,9 @@ def script() -> ModuleType:
         ("--make-bundle --object cube --mass 2", "--mass 2.0 is for searches"),
         ("--make-bundle --object cube --validate sapien", "--validate sapien is for searches"),
         ("--rank-in-task --object cube --seed 3", "--seed 3 is for searches"),
+        ("--refine-in-task", "need --object"),
+        ("--refine-in-task --object cube --seed 3", "--seed 3 is for searches"),
+        ("--refine-in-task --object microwave", "DoraMicrowave-v1 has several arms"),
         ("--contact-maps --object cube --any-region", "--any-region True is for searches"),
         ("--object cube --any-region", "a search takes --region any"),
         ("--rank-in-task --object spoon", "no object 'spoon'"),
@@ -81,7 +84,7 @@ def test_bad_input(
     arguments: str,
     words: str,
 ):
-    for work in ("generate", "make_bundle", "rank_bundled_set", "map_bundled_set"):
+    for work in ("generate", "make_bundle", "rank_bundled_set", "refine_bundled_set", "map_bundled_set"):
         if "cube" in arguments:
             monkeypatch.setattr(script, work, lambda *_, **__: pytest.fail("work has begun"))
     assert words in refusal(script, monkeypatch, capsys, arguments)

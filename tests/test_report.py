@@ -68,14 +68,14 @@ def test_runs_of_tasks_with_other_numbers_are_not_averaged(tmp_path: Path):
         path.write_text(json.dumps(json.loads(path.read_text()) | {"task_config": each}))
     rows = tables(find_runs(tmp_path)).splitlines()[2:]
     assert [row.split(" | ")[3:5] for row in rows] == [
-        ["affordance, optimised False", "2"], ["affordance, optimised True", "1"],
+        ["affordance, grasp made by hand", "2"], ["affordance, grasps of the search", "1"],
     ]  # fmt: skip
     path = tmp_path / "1" / "result.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"task_config": numbers[0] | {"weights": {"lift": 1.0}}}))
     rows = tables(find_runs(tmp_path)).splitlines()[2:]
     assert [row.split(" | ")[3] for row in rows] == [
-        "affordance, optimised False, weights.lift 1.0", "affordance, optimised False, weights.lift 3.0",
-        "affordance, optimised True, weights.lift 2.0",
+        "affordance, grasp made by hand, weights.lift 1.0", "affordance, grasp made by hand, weights.lift 3.0",
+        "affordance, grasps of the search, weights.lift 2.0",
     ]  # fmt: skip
 
 

@@ -16,8 +16,8 @@ from dora.tasks import make_task
 from dora.tasks.cube import hand_made_candidates
 from dora.tools.in_task.ranking import (
     TaskRanking,
-    _as_mapping,
     _Balanced,
+    as_mapping,
     rank_bundled_set,
     rank_in_task,
     ranked,
@@ -54,9 +54,9 @@ def test_every_reachable_candidate_is_tried_equally_often_and_no_other():
 
 @pytest.mark.parametrize("settings", ["seat=1", "[" * 100_000, '{"a":' * 50 + "1" + "}" * 50, "[1, 2]"])
 def test_settings_of_early_files_are_those_of_the_search_whatever_they_are(settings: str):
-    assert _as_mapping(settings) == {"search": settings}
-    assert _as_mapping('{"ranking_steps": 3}') == {"ranking_steps": 3}
-    assert _as_mapping("") == {}
+    assert as_mapping(settings) == {"search": settings}
+    assert as_mapping('{"ranking_steps": 3}') == {"ranking_steps": 3}
+    assert as_mapping("") == {}
 
 
 def test_a_start_without_any_candidate_is_no_try():

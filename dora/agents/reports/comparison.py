@@ -14,6 +14,7 @@ from dora.agents.reports.run_results import (
     UNKNOWN,
     Run,
     grouped,
+    in_words,
     shared_mark,
     success_shares,
     zero_episodes,
@@ -95,7 +96,9 @@ def variant(runs: Sequence[Run]) -> str:
     """Budget of the runs of a cell, and in what the numbers of their task differ from those of other runs."""
     steps = f"{runs[0].budget / 1000:.0f}k"
     words = runs[0].result.get("task_config") or {}
-    switches = [f"{name} {value}" for name, value in words.items() if isinstance(value, bool) and name in SWITCHES]
+    switches = [
+        in_words(name, str(value)) for name, value in words.items() if isinstance(value, bool) and name in SWITCHES
+    ]
     return ", ".join([steps, *switches])
 
 

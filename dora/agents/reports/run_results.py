@@ -23,6 +23,9 @@ ALONE = 0.1
 SHARED, UNKNOWN = " \N{DAGGER}", " ?"
 """Marks of minutes beside other programs, and of minutes of which that was not measured."""
 
+IN_WORDS = {("optimised", "False"): "grasp made by hand", ("optimised", "True"): "grasps of the search"}
+"""Values of switches of tasks, by name and value, as readers of a table know them."""
+
 Group = tuple[str, str, str, str, int]
 """Environment, preset, agent, guidance, steps in thousands (rounded): what the runs of one row of the table share."""
 
@@ -148,8 +151,13 @@ def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
     found: dict[str, list[Run]] = defaultdict(list)
     for run, values in zip(runs, by_switch if enough else by_all, strict=True):
         words = zip(switches if enough else different, values, strict=True)
-        found["".join(f", {name} {value}" for name, value in words)].append(run)
+        found["".join(f", {in_words(name, value)}" for name, value in words)].append(run)
     return found
+
+
+def in_words(name: str, value: str) -> str:
+    """A number or switch of a task with its value."""
+    return IN_WORDS.get((name, value), f"{name} {value}")
 
 
 def _learner(run: Run) -> dict[str, Any]:
