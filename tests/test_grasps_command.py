@@ -12,7 +12,7 @@ import pytest
 import torch
 from commands import call, load_command, refusal
 
-from dora.affordance.bundled_sets import bundled_path
+from dora.affordance.bundled_sets import bundled_path, load_candidates
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.contact_maps import with_contact_maps
 from dora.affordance.hand.grasp_test_settings import STANDARD
@@ -147,6 +147,26 @@ def test_files_and_table(
     names = ("no_closure", "unseated", "unseated_no_closure", "unseated_one_iteration")
     assert {name: b["requested"] for name, b in report["baselines"].items()} == dict.fromkeys(names, 3)
     assert sorted(p.name for p in out.parent.iterdir()) == ["jug.json", "jug.safetensors"]
+
+
+@pytest.mark.parametrize(("words", "region"), [("--refine-in-task", True), ("--refine-in-task --any-region", False)])
+def test_refining_says_what_it_took(
+    words: str, region: bool, script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    asked: list[tuple[str, bool]] = []
+
+    def refine(name: str, phases: object, region: bool) -> list[Path]:
+        asked.append((name, region))
+        return [bundled_path("jug")]
+
+    monkeypatch.setattr(script, "refine_bundled_set", refine)
+    assert call(script, monkeypatch, "--object", "jug", *words.split()) == 0
+    assert asked == [("jug", region)]
+    found = load_candidates("jug")
+    path, ranking = capsys.readouterr().out.splitlines()
+    assert path == str(bundled_path("jug"))
+    assert f"{found.ranking_steps:,} control steps" in ranking
+    assert f"best: {found.score[0]:.2f}, {found.score[1]:.2f}" in ranking
 
 
 def test_contact_maps_of_a_folder(

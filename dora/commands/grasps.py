@@ -10,12 +10,14 @@ iteration), and writes OUT (safetensors) and a .json beside it. `dora view OUT` 
 
 import sys
 import unicodedata
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
+from dora.affordance.candidates import GraspCandidates
 from dora.affordance.contact_maps import map_bundled_set
 from dora.affordance.maps.affordance_map import COUNT
 from dora.affordance.maps.packed_maps import MOST_CELLS
@@ -54,6 +56,8 @@ TAKEN = {
     "contact_maps": (),
 }
 """What takes no options of searches, and the options that it does take beside --object."""
+SHOWN = 5
+"""Number of scores that are printed of a ranked set."""
 ANY = "any"
 """Value of --region for a search without a region."""
 
@@ -210,6 +214,14 @@ def about(wanted: Target) -> dict[str, Any]:
     }
 
 
+def print_ranked(paths: Sequence[Path]) -> None:
+    """Files of sets, with what their ranking took and its best scores."""
+    for path in paths:
+        found = GraspCandidates.load(path)
+        best = ", ".join(f"{score:.2f}" for score in found.score[:SHOWN].tolist())
+        print(f"{path}\n  ranked by {found.ranking_steps:,} control steps of the task; scores of the best: {best}")
+
+
 def remake(args: Args) -> None:
     """Make, rank or refine the bundled set of an object, or make its contact maps anew."""
     asked = [f"--{name.replace('_', '-')}" for name in TAKEN]
@@ -232,10 +244,9 @@ def remake(args: Args) -> None:
             usable, settings = usable_in_task(name), Settings(seat=args.seat)
             print(make_bundle(name, args.seed, phases, usable, not args.any_region, settings))
         if args.rank_in_task or (args.make_bundle and ids):
-            paths = rank_bundled_set(name, lambda title: phases.phase(title, "episodes"), not args.any_region)
-            print("\n".join(map(str, paths)))
+            print_ranked(rank_bundled_set(name, lambda title: phases.phase(title, "episodes"), not args.any_region))
         if args.refine_in_task:
-            print("\n".join(map(str, refine_bundled_set(name, phases, not args.any_region))))
+            print_ranked(refine_bundled_set(name, phases, not args.any_region))
 
 
 @command
