@@ -137,14 +137,17 @@ def test_what_a_task_reports_is_counted():
     plain.close()
 
 
-@pytest.mark.parametrize(("guidance", "asked"), [("affordance", True), ("affordance", False), ("none", True)])
-def test_the_zero_action_is_evaluated_where_it_is_asked_for_and_corrects_something(guidance: str, asked: bool):
-    """Without a prior it is an ordinary command and no baseline."""
+@pytest.mark.parametrize(
+    ("guidance", "asked"), [("affordance", None), ("affordance", False), ("none", None), ("none", True)]
+)
+def test_the_zero_action_is_evaluated_where_it_is_asked_for_and_corrects_something(guidance: str, asked: bool | None):
+    """It is asked for unless that is left out; without a prior it is an ordinary command and no baseline."""
     config = dataclasses.replace(CONFIG, workers=1, guidance=guidance, final_episodes=2)
     evaluators = Evaluators(PointMass, config)
     policy = make_learner(config, *evaluators.sizes).policy
-    zero = evaluators.final(policy, zero=asked, first_seed=0)[1]
-    assert (zero is not None) == (asked and guidance == "affordance")
+    chosen = {} if asked is None else {"zero": asked}
+    zero = evaluators.final(policy, first_seed=0, **chosen)[1]
+    assert (zero is not None) == (asked is not False and guidance == "affordance")
     evaluators.close()
 
 

@@ -63,6 +63,16 @@ def test_each_hand_of_several_arms_has_a_camera():
     assert [config.uid for config in camera_configs(specs, {"arm": left}, mode)] == list(CAMERAS)
 
 
+@pytest.mark.parametrize(
+    ("mode", "shader"),
+    [("rgb+depth", "minimal"), ("position+segmentation", "minimal"), ("albedo", "default"), ("rgb+normal", "default")],
+)
+def test_only_a_mode_that_the_minimal_shader_draws_whole_takes_it(mode: str, shader: str):
+    wanted = parse_obs_mode_to_struct(mode)
+    configs = camera_configs(TASKS["DoraCube-v1"].CAMERAS, {"arm": Link.__new__(Link)}, wanted)
+    assert [config.shader_pack for config in configs] == [shader] * 2
+
+
 WRONG = [
     ({"sensor_configs": {"hnd_camera": {"width": 64}}}, "no camera 'hnd_camera'.*hand_camera"),
     ({"sensor_configs": {"hand_camera": {"widht": 64}}}, "no 'widht'.*width"),
