@@ -2,7 +2,7 @@
 
 What a search finds is ranked, but nothing asks the search itself for grasps that the task lifts well. Near a grasp that
 it does lift well there are more of them: of a search that begins near others two fifths are strictly valid and usable,
-of one that begins anywhere a twentieth (the jug's handle).
+of one that begins anywhere a fifteenth (the jug's handle).
 """
 
 import json
