@@ -149,19 +149,21 @@ def test_files_and_table(
     assert sorted(p.name for p in out.parent.iterdir()) == ["jug.json", "jug.safetensors"]
 
 
-@pytest.mark.parametrize(("words", "region"), [("--refine-in-task", True), ("--refine-in-task --any-region", False)])
+@pytest.mark.parametrize(
+    ("words", "region"), [("--refine-in-task", True), ("--refine-in-task --any-region --seat 0", False)]
+)
 def test_refining_says_what_it_took(
     words: str, region: bool, script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    asked: list[tuple[str, bool]] = []
+    asked: list[tuple[str, bool, float]] = []
 
-    def refine(name: str, phases: object, region: bool) -> list[Path]:
-        asked.append((name, region))
+    def refine(name: str, phases: object, region: bool, settings: Settings) -> list[Path]:
+        asked.append((name, region, settings.seat))
         return [bundled_path("jug")]
 
     monkeypatch.setattr(script, "refine_bundled_set", refine)
     assert call(script, monkeypatch, "--object", "jug", *words.split()) == 0
-    assert asked == [("jug", region)]
+    assert asked == [("jug", region, Settings().seat if region else 0.0)]
     found = load_candidates("jug")
     path, ranking = capsys.readouterr().out.splitlines()
     assert path == str(bundled_path("jug"))

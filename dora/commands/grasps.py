@@ -52,7 +52,7 @@ RANGES = {
 TAKEN = {
     "make_bundle": ("seed", "seat", "any_region"),
     "rank_in_task": ("any_region",),
-    "refine_in_task": ("any_region",),
+    "refine_in_task": ("seat", "any_region"),
     "contact_maps": (),
 }
 """What takes no options of searches, and the options that it does take beside --object."""
@@ -246,7 +246,7 @@ def remake(args: Args) -> None:
         if args.rank_in_task or (args.make_bundle and ids):
             print_ranked(rank_bundled_set(name, lambda title: phases.phase(title, "episodes"), not args.any_region))
         if args.refine_in_task:
-            print_ranked(refine_bundled_set(name, phases, not args.any_region))
+            print_ranked(refine_bundled_set(name, phases, not args.any_region, Settings(seat=args.seat)))
 
 
 @command

@@ -12,6 +12,7 @@ from pathlib import Path
 from dora.affordance.bundled_sets import ROBOT, bundled_path, load_candidates
 from dora.affordance.candidates import GraspCandidates, concatenate
 from dora.affordance.objects.catalogue import load_object
+from dora.affordance.search.optimise import Settings
 from dora.errors import InputError
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
@@ -40,7 +41,11 @@ FINAL_TRIES = 30
 
 
 def refine_bundled_set(
-    name: str | Path, phases: ProgressDisplay, region: bool = True, generations: int = GENERATIONS
+    name: str | Path,
+    phases: ProgressDisplay,
+    region: bool = True,
+    settings: Settings | None = None,
+    generations: int = GENERATIONS,
 ) -> list[Path]:
     """Refines the bundled grasps of an object that have been ranked in its task, and stores them anew, best first.
 
@@ -51,6 +56,7 @@ def refine_bundled_set(
         name: of an object or its folder, as for `load_object`.
         phases: display of the progress.
         region: as for `rank_bundled_set`.
+        settings: of the search; those with which the set was made, or the defaults if None.
         generations: how often is searched near the best.
 
     Returns:
@@ -75,7 +81,7 @@ def refine_bundled_set(
     wanted = found.of_class(obj.target_class) | (not region)
     known = found.select(wanted)
     known = known.select(known.score.nan_to_num(nan=0.0).argsort(descending=True, stable=True))
-    refinement = Refinement(name, ids[0], phases, region)
+    refinement = Refinement(name, ids[0], phases, region, settings)
     top = known.select(slice(PARENTS))
     for generation in range(generations):
         top = refinement.generation(top, generation)
@@ -84,10 +90,10 @@ def refine_bundled_set(
     parts = [top] if rest is None else [top, replace(rest, score=rest.score.clamp(max=float(top.score.min())))]
     kept = concatenate(parts).select(slice(KEPT))
     others = [] if wanted.all() else [found.select(~wanted)]
-    settings = as_mapping(found.settings)
-    settings |= {"ranking_steps": found.ranking_steps + refinement.steps, "generations": generations}
+    made = as_mapping(found.settings)
+    made |= {"ranking_steps": found.ranking_steps + refinement.steps, "generations": generations}
     path = bundled_path(name, region)
-    replace(concatenate([kept, *others]), settings=json.dumps(settings)).save(path)
+    replace(concatenate([kept, *others]), settings=json.dumps(made)).save(path)
     bundle_feasibility_tables(name)
     return [path]
 
@@ -95,9 +101,9 @@ def refine_bundled_set(
 class Refinement:
     """Searches near grasps of an object, and executes them in a task; `steps` counts the control steps of that."""
 
-    def __init__(self, name: str | Path, env_id: str, phases: ProgressDisplay, region: bool):
+    def __init__(self, name: str | Path, env_id: str, phases: ProgressDisplay, region: bool, settings: Settings | None):
         self.obj, self.env_id, self.phases, self.region = load_object(name), env_id, phases, region
-        self.maker = SetMaker(self.obj, load_robot(ROBOT), phases, usable_in_task(name))
+        self.maker = SetMaker(self.obj, load_robot(ROBOT), phases, usable_in_task(name), settings)
         self.steps = 0
 
     def generation(self, parents: GraspCandidates, index: int) -> GraspCandidates:
