@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.contact_maps import mapped
 from dora.affordance.maps.voting import NO_CONTACT, vote_over_map
@@ -14,12 +17,15 @@ from dora.affordance.views.map_pictures import picture_map
 from dora.affordance.views.pictures import caption, picture_contacts, picture_grasps, picture_objects
 from dora.affordance.views.surface import Surface
 from dora.errors import InputError
+from dora.geometry.rotations import rotation_angle
 from dora.robot import RobotDescription
 
 SHOWN = 4
 """Largest number of grasps in a picture."""
 FINER = 2.0
 """Ratio of the edges of triangles on a page to those in a picture of contact semantic maps [1]."""
+METRES_PER_RADIAN = 0.1
+"""Distance that a turn of the wrist counts as [m/rad]."""
 OBJECTS = "objects.png"
 """File name of the picture of all objects."""
 
@@ -74,9 +80,17 @@ def _make(folder: Path) -> None:
 
 
 def chosen(candidates: GraspCandidates) -> list[int]:
-    """Rows of at most `SHOWN` valid grasps (of any if none is valid): the first of every class, then the next ones."""
+    """Rows of at most `SHOWN` valid grasps (of any if none is valid): the first of every class, then one by one
+    the grasp whose wrist is farthest from those that are shown already."""
     valid = candidates.valid.nonzero()[:, 0].tolist() or list(range(len(candidates)))
     names = candidates.grasp_class
-    first = [row for i, row in enumerate(valid) if names[row] not in {names[other] for other in valid[:i]}]
-    rest = [row for row in valid if row not in first]
-    return sorted((first + rest)[:SHOWN])
+    found = [row for i, row in enumerate(valid) if names[row] not in {names[other] for other in valid[:i]}][:SHOWN]
+    position, turn = candidates.position[valid], candidates.quaternion[valid]
+
+    def away(row: int) -> Tensor:
+        distance = (position - candidates.position[row]).norm(dim=-1)
+        return distance + METRES_PER_RADIAN * rotation_angle(turn, candidates.quaternion[row].expand_as(turn))
+
+    while len(found) < min(SHOWN, len(valid)):
+        found.append(valid[int(torch.stack([away(row) for row in found]).amin(0).argmax())])
+    return sorted(found)
