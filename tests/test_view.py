@@ -289,7 +289,7 @@ def test_pictures_instead_of_the_page(
     views = imageio.imread(paths[2])[: 2 * SMALL, :, :3]  # without the legend
     pixels, faces = _seen_parts(views), _touched_parts()
     assert [part for part in faces if pixels[part]] == [part for part in faces if faces[part]] == list(PARTS)[1:]
-    assert np.corrcoef(list(pixels.values()), list(faces.values()))[0, 1] > 0.9
+    assert np.corrcoef(list(pixels.values()), list(faces.values()))[0, 1] > 0.75
     assert len(np.unique(imageio.imread(paths[0])[..., :3].reshape(-1, 3), axis=0)) > 100
     (tmp_path / "file").write_text("")
     assert call(script, monkeypatch, "jug", "--pictures", str(tmp_path / "file" / "x")) == 2
@@ -369,12 +369,8 @@ def test_those_farthest_from_each_other_are_pictured_beside_the_best(candidates:
     line = replace(candidates, position=along, quaternion=alike, valid=valid, grasp_class=("BodyGrasp",) * COUNT)
     assert chosen(line) == [0, 3, 4, 6]
     turned = torch.tensor([[0.0, 1.0, 0.0, 0.0]]).expand(COUNT, 4)
-    assert chosen(replace(line, quaternion=torch.where(torch.arange(COUNT)[:, None] == 4, turned, alike)))[:4] == [
-        0,
-        1,
-        3,
-        4,
-    ]
+    one_turned = torch.where(torch.arange(COUNT)[:, None] == 4, turned, alike)
+    assert chosen(replace(line, quaternion=one_turned)) == [0, 1, 3, 4]
 
 
 def test_maps_and_titles_are_those_of_the_chosen_grasps(
