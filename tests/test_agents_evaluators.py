@@ -145,8 +145,8 @@ def test_the_zero_action_is_evaluated_where_it_is_asked_for_and_corrects_somethi
     config = dataclasses.replace(CONFIG, workers=1, guidance=guidance, final_episodes=2)
     evaluators = Evaluators(PointMass, config)
     policy = make_learner(config, *evaluators.sizes).policy
-    chosen = {} if asked is None else {"zero": asked}
-    zero = evaluators.final(policy, first_seed=0, **chosen)[1]
+    unsaid = asked is None
+    zero = (evaluators.final(policy, first_seed=0) if unsaid else evaluators.final(policy, zero=asked, first_seed=0))[1]
     assert (zero is not None) == (asked is not False and guidance == "affordance")
     evaluators.close()
 
