@@ -1,5 +1,4 @@
-"""Initial hand poses: the open palm in front of a surface point, the fingers across the part to be held; or near those
-of given candidates."""
+"""Initial hand poses: the open palm in front of a surface point, or near the hands of given candidates."""
 
 from __future__ import annotations
 
