@@ -127,8 +127,8 @@ def test_the_filter_leaves_only_what_it_accepts(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.slow
 def test_what_f_reach_rejects_fails_more_than_twice_as_often():
-    found = outcomes("DoraJug-v1", 64, "none", "random")
+    found = outcomes("DoraJug-v1", 192, "standard", "random")
     accepted, rejected = found.failure_rates()
     print(f"accepted candidates fail in {accepted:.2f}, rejected ones in {rejected:.2f}")
     assert rejected > 2 * accepted
-    assert rejected > 0.5
+    assert rejected > 0.4
