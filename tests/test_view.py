@@ -371,6 +371,7 @@ def test_those_farthest_from_each_other_are_pictured_beside_the_best(candidates:
     turned = torch.tensor([[0.0, 1.0, 0.0, 0.0]]).expand(COUNT, 4)
     one_turned = torch.where(torch.arange(COUNT)[:, None] == 4, turned, alike)
     assert chosen(replace(line, quaternion=one_turned)) == [0, 1, 3, 4]
+    assert chosen(replace(line, position=torch.zeros(COUNT, 3))) == [0, 1, 2, 3]
 
 
 def test_maps_and_titles_are_those_of_the_chosen_grasps(

@@ -92,5 +92,7 @@ def chosen(candidates: GraspCandidates) -> list[int]:
         return distance + METRES_PER_RADIAN * rotation_angle(turn, candidates.quaternion[row].expand_as(turn))
 
     while len(found) < min(SHOWN, len(valid)):
-        found.append(valid[int(torch.stack([away(row) for row in found]).amin(0).argmax())])
+        nearest = torch.stack([away(row) for row in found]).amin(0)
+        nearest[[valid.index(row) for row in found]] = -1.0  # none twice, where grasps are alike
+        found.append(valid[int(nearest.argmax())])
     return sorted(found)
