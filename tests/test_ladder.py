@@ -127,8 +127,10 @@ def test_the_filter_leaves_only_what_it_accepts(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.slow
 def test_what_f_reach_rejects_fails_more_than_twice_as_often():
-    found = outcomes("DoraJug-v1", 192, "standard", "random")
+    """Of all stored grasps by the handle: the twelve best are alike, and nearly all of them can be carried out."""
+    every = {"most_candidates": 96, "fewest_lifts": 0.0}
+    found = outcomes("DoraJug-v1", 64, "none", "random", every)
     accepted, rejected = found.failure_rates()
     print(f"accepted candidates fail in {accepted:.2f}, rejected ones in {rejected:.2f}")
     assert rejected > 2 * accepted
-    assert rejected > 0.4
+    assert rejected > 0.5

@@ -10,7 +10,7 @@ twice as often as what is accepted, or the filter does not pay.
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -95,8 +95,8 @@ def tabulated_ids() -> list[str]:
     return [env_id for env_id, task in alone.items() if task(task.CONFIG()).start_grid(*task.ARMS) is not None]
 
 
-def outcomes(env_id: str, episodes: int, preset: str, choice: Choice) -> Outcomes:
-    """Runs episodes with zero correction and without the filter.
+def outcomes(env_id: str, episodes: int, preset: str, choice: Choice, config: dict[str, Any] | None = None) -> Outcomes:
+    """Runs episodes with zero correction and without the filter; `config` as for `make_task`.
 
     Raises:
         InputError: there is no such task, or it has several arms or no table of f_reach.
@@ -105,7 +105,7 @@ def outcomes(env_id: str, episodes: int, preset: str, choice: Choice) -> Outcome
     check_task_id(env_id)
     if env_id not in (able := tabulated_ids()):
         raise InputError(f"{env_id} is no task of one arm with a table of f_reach: choose one of {', '.join(able)}.")
-    task = make_task(env_id, BATCH, preset=preset, guidance_parts=parts)
+    task = make_task(env_id, BATCH, preset=preset, guidance_parts=parts, config=config)
     task.narrow = {task.arm.name: _Drawn(task)} if choice == "random" else {}
     reasons, won = [], []
     with ProgressDisplay() as phases:
