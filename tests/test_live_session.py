@@ -2,9 +2,10 @@
 
 import itertools
 import math
+import re
 import time
 from collections.abc import Iterator
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from dora.live.orders import Choose, Play, Push, Randomise, Repeat, Reset, Run, 
 from dora.live.players import ZERO, Player, zero_correction
 from dora.live.reading import verdict
 from dora.live.session import Session
+from dora.live.status import ACTIVE, GOOD, QUIET, status
 
 BUSY = "busy"
 """A player that moves the fingers."""
@@ -53,8 +55,9 @@ def test_an_episode_walks_all_stages_succeeds_and_is_followed_by_the_next(cube: 
     seen, setup = [], cube.state.setup
     for _ in range(setup.max_steps):
         state = cube.steps(1)
-        seen.append(state.episode.stage)
-    assert sorted(set(seen)) == list(range(len(setup.stages) + 1))
+        seen.append(*state.episode.stages)
+    (ladder,) = setup.ladders
+    assert sorted(set(seen)) == list(range(len(ladder) + 1))
     assert state.episode.over
     assert state.episode.success
     assert state.episode.verdict.startswith("success: all stages done")
@@ -253,7 +256,7 @@ def test_a_policy_keeps_its_numbers_of_the_task_under_another_preset():
 
 def test_forces_are_those_that_the_task_reads(hammer: Watched):
     state = hammer.steps(45)
-    assert state.episode.stage >= 2
+    assert state.episode.stages[0] >= 2
     hand = hammer.env.snapshot.hand
     parts = ("thumb", "index", "middle", "ring", "pinky", "palm")
     shown = dict(zip(state.forces.pairs, np.linalg.norm(state.forces.forces, axis=1).tolist(), strict=True))
@@ -294,7 +297,7 @@ def test_a_state_is_frozen_and_its_history_does_not_grow(cube: Watched):
 
 def info(**given: float | bool) -> dict[str, torch.Tensor]:
     base = {"success": False, "raw_success": False, "fail": False, "unreachable": False, "penetration_max_mm": 1.0}
-    return {name: torch.tensor([value]) for name, value in {**base, "stage": 1, **given}.items()}
+    return {name: torch.tensor([value]) for name, value in {**base, **given}.items()}
 
 
 @pytest.mark.parametrize(
@@ -304,9 +307,9 @@ def info(**given: float | bool) -> dict[str, torch.Tensor]:
         ({}, True, "failed: the time was over in the stage 'stabilise'"),
         ({"fail": True}, True, "failed: it burst"),
         ({"fail": True, "unreachable": True}, True, "failed: no candidate can be reached from this start"),
-        ({"success": True, "stage": 4}, True, "success: all stages done, largest overlap 1.0 mm"),
+        ({"success": True}, True, "success: all stages done, largest overlap 1.0 mm"),
         (
-            {"raw_success": True, "penetration_max_mm": 7.25, "stage": 4},
+            {"raw_success": True, "penetration_max_mm": 7.25},
             True,
             "failed: an overlap of 7.2 mm, above the limit of 5 mm",
         ),
@@ -314,7 +317,23 @@ def info(**given: float | bool) -> dict[str, torch.Tensor]:
     ],
 )
 def test_the_verdict_names_the_cause(hammer: Watched, given: dict[str, Any], over: bool, words: str):
-    assert verdict(hammer.state.setup, "it burst", info(**given), over) == words
+    assert verdict(hammer.state.setup, (1,), "it burst", info(**given), over) == words
+
+
+@pytest.mark.parametrize(
+    ("stages", "words"),
+    [((0, 2), "'open'"), ((2, 1), "'put_in'"), ((1, 0), "'leave' and 'carry'"), ((2, 2), "'leave' and 'put_in'")],
+)
+def test_each_arm_has_a_ladder_of_its_own(cube: Watched, stages: tuple[int, int], words: str):
+    """An arm that is ahead says nothing about the other; last, both were done, but not at the same time."""
+    ladders = ("open", "leave"), ("carry", "put_in")
+    setup = replace(cube.state.setup, ladders=ladders)
+    assert verdict(setup, stages, "", info(), True) == f"failed: the time was over in the stage {words}"
+    shown = status(replace(cube.state, setup=setup, episode=replace(cube.state.episode, stages=stages)))
+    for ladder, active in zip(ladders, stages, strict=True):
+        for k, name in enumerate(ladder):
+            (box,) = re.findall(rf"background: (#\w+);[^>]*>{name}</span>", shown)
+            assert box == (GOOD if k < active else ACTIVE if k == active else QUIET), name
 
 
 def wait_for(found: Any, patience: float = 60.0) -> None:
@@ -368,7 +387,7 @@ def test_two_arms_are_shown_without_candidates_and_starts_to_choose():
         assert words in watched.do(order).message
     state = watched.to_the_end()
     assert state.episode.over
-    assert state.episode.furthest > setup.stages.index("open")
+    assert state.episode.stages[0] > setup.ladders[0].index("open")
     assert state.episode.history.terms.shape == (state.episode.step, len(setup.terms))
     watched.session.stop()
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dora.errors import InputError, shown
 from dora.live.players import Player
-from dora.live.reading import EpisodeLog, Reader, read_setup, verdict
+from dora.live.reading import EpisodeLog, Reader, active_stages, read_setup, verdict
 from dora.live.recordings import RecordedEpisode
 from dora.live.state import Episode, Poses, Setup
 from dora.sim.batch.resets import START
@@ -169,15 +169,14 @@ class LiveTask:
 
     def episode(self) -> Episode:
         """How the episode stands."""
-        env, info = self.env, self._info
+        env, info, stages = self.env, self._info, active_stages(self.env.machine)
         return Episode(
             seed=self.beginning.seed,
             step=self._steps,
             time=self._steps * self.setup.dt,
-            stage=int(info["stage"][0]),
-            furthest=int(env.machine.furthest[0]),
+            stages=stages,
             reward=self._reward,
-            verdict=verdict(self.setup, env.mdp.failure, info, self.over),
+            verdict=verdict(self.setup, stages, env.mdp.failure, info, self.over),
             success=bool(info["success"][0]),
             over=self.over,
             chosen={name: int(choice.buffers.chosen[0]) for name, choice in env.arms.choices.items()},

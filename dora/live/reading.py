@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ from jaxtyping import Float
 from dora.live.state import Forces, Goal, History, Poses, Setup
 from dora.sim.substeps import watch_physics
 from dora.tasks.env.env import DoraEnv
+from dora.tasks.mdp.mdp import Mdp
 from dora.tasks.mdp.memory import MM
+from dora.tasks.mdp.stages import Stage, Stages
 
 REWARD = "reward/"
 """What the names of a reward's terms begin with in the info of a step."""
@@ -29,7 +32,7 @@ def read_setup(env: DoraEnv, env_id: str) -> Setup:
         handles={name: arm.spec.object for name, arm in env.arms.items()},
         objects=tuple(env.objects),
         fixtures={name: shapes for name, (_, shapes) in env.task.drawn(env.task_scene).items()},
-        stages=env.stage_names,
+        ladders=tuple(tuple(stage.name for stage in ladder) for ladder in ladders(env.mdp)),
         terms=tuple(env.terms.terms),
         limit=env.mdp.penetration_limit * MM,
         dt=env.config.dt,
@@ -40,6 +43,16 @@ def read_setup(env: DoraEnv, env_id: str) -> Setup:
         if candidates is not None
         else (),
     )
+
+
+def ladders(mdp: Mdp[Any]) -> list[Sequence[Stage[Any]]]:
+    """The stages of a task, in order; of each arm if they have stages of their own."""
+    return list(mdp.stages.values()) if isinstance(mdp.stages, Mapping) else [mdp.stages]
+
+
+def active_stages(machine: Stages) -> tuple[int, ...]:
+    """Index of the active stage of each of `ladders` in the first environment."""
+    return tuple(int(index[0]) for index in machine.by_arm().values()) or (int(machine.index[0]),)
 
 
 def _words(index: int, grasp_class: str, score: float) -> str:
@@ -144,17 +157,18 @@ class EpisodeLog:
         return History(time=rows[:, 0], terms=rows[:, 3:], overlap=rows[:, 1:3])
 
 
-def verdict(setup: Setup, failure: str, info: dict[str, Any], over: bool) -> str:
+def verdict(setup: Setup, stages: Sequence[int], failure: str, info: dict[str, Any], over: bool) -> str:
     """How an episode stands, or how it ended and why.
 
     Args:
         setup: of the environment.
+        stages: the active one of each of its ladders.
         failure: what has happened in an episode that cannot be mended, in words.
         info: of the last step.
         over: the episode has ended.
     """
     flags = {name: bool(info[name][0]) for name in ("success", "raw_success", "fail", "unreachable")}
-    max_penetration, stage = float(info["penetration_max_mm"][0]), int(info["stage"][0])
+    max_penetration = float(info["penetration_max_mm"][0])
     overlap = f"an overlap of {max_penetration:.1f} mm, above the limit of {setup.limit:g} mm"
     if flags["unreachable"]:
         return "failed: no candidate can be reached from this start"
@@ -165,5 +179,11 @@ def verdict(setup: Setup, failure: str, info: dict[str, Any], over: bool) -> str
     if max_penetration > setup.limit:
         return f"{'failed' if over else 'cannot succeed any more'}: {overlap}"
     if over:
-        return f"failed: the time was over in the stage {setup.stages[min(stage, len(setup.stages) - 1)]!r}"
+        return f"failed: the time was over in the stage {' and '.join(_unfinished(setup, stages))}"
     return "under way"
+
+
+def _unfinished(setup: Setup, stages: Sequence[int]) -> list[str]:
+    """Active stages of the ladders that are not done, or the last ones where all were done before the others."""
+    under_way = [repr(ladder[k]) for ladder, k in zip(setup.ladders, stages, strict=True) if k < len(ladder)]
+    return under_way or [repr(ladder[-1]) for ladder in setup.ladders]

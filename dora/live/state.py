@@ -23,7 +23,7 @@ class Setup:
         handles: name of the object that each arm handles.
         objects: names of the objects.
         fixtures: shapes of the other bodies that are drawn, by name.
-        stages: names of the stages, in order.
+        ladders: names of the stages, in order; of each arm if they have stages of their own.
         terms: names of the reward's terms.
         limit: largest overlap of an episode that counts as a success [mm].
         dt: duration of a control step [s].
@@ -38,7 +38,7 @@ class Setup:
     handles: Mapping[str, str]
     objects: tuple[str, ...]
     fixtures: Mapping[str, tuple[DrawnShape, ...]]
-    stages: tuple[str, ...]
+    ladders: tuple[tuple[str, ...], ...]
     terms: tuple[str, ...]
     limit: float
     dt: float
@@ -93,7 +93,7 @@ class Episode:
     Attributes:
         seed: of its start.
         step, time: control steps since then, and the same in seconds.
-        stage, furthest: index of the active stage and of the furthest one; the number of stages when all are done.
+        stages: index of the active stage of each of `Setup.ladders`; the number of its stages when all are done.
         reward: of the last step.
         verdict: how it stands, or how it ended and why.
         success: whether it counts as a success as it stands.
@@ -107,8 +107,7 @@ class Episode:
     seed: int
     step: int
     time: float
-    stage: int
-    furthest: int
+    stages: tuple[int, ...]
     reward: float
     verdict: str
     success: bool

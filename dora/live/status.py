@@ -14,18 +14,23 @@ def status(state: LiveState) -> str:
     """HTML about a state; text of others is escaped."""
     episode, setup = state.episode, state.setup
     colour = GOOD if episode.success else BAD if episode.over else ACTIVE
-    colours = [GOOD if k < episode.stage else ACTIVE if k == episode.stage else QUIET for k in range(len(setup.stages))]
-    stages = "".join(_box(name, c) for name, c in zip(setup.stages, colours, strict=True))
+    ladders = map(_ladder, setup.ladders, episode.stages)
     rate = f"{state.rate:.2f} of real time" if state.rate else "stands still"
     lines = [
         f'<div style="color: {colour}; font-weight: 700">{escape(episode.verdict)}</div>',
-        f"<div>{stages}</div>",
+        *(f"<div>{ladder}</div>" for ladder in ladders),
         f"<div>{episode.time:.2f} s of {setup.max_steps * setup.dt:.0f} s, seed {episode.seed}, {rate}</div>",
         f"<div>{state.successes} of {state.episodes} episodes succeeded; {escape(_candidates(state))}</div>",
     ]
     if state.message:
         lines.append(f'<div style="color: {BAD}">{escape(state.message)}</div>')
     return f'<div style="padding: 0.3em 1em; line-height: 1.6; font-size: 0.9em">{"".join(lines)}</div>'
+
+
+def _ladder(stages: tuple[str, ...], active: int) -> str:
+    """The stages of one arm, or of all: those done, the active one, and the rest."""
+    colours = [GOOD if k < active else ACTIVE if k == active else QUIET for k in range(len(stages))]
+    return "".join(map(_box, stages, colours))
 
 
 def _box(text: str, colour: str) -> str:
