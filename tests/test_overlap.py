@@ -10,8 +10,12 @@ import torch
 from solids import PairWatch, Solids, depth
 
 import dora.tasks as tasks
+from dora.sim.overlap import OverlapMonitor
 from dora.sim.substeps import watch_physics
+from dora.tasks.cube import CubeConfig, CubeTask
+from dora.tasks.env import options
 from dora.tasks.env.env import DoraEnv
+from dora.tasks.env.options import task_config
 from dora.tasks.microwave.snapshot import LEFT, RIGHT
 
 OVEN = ("handle", "door", "body")
@@ -188,3 +192,44 @@ def test_every_pair_of_the_microwave_is_watched(two_arms: DoraEnv, pair: tuple[s
     names = [{link._bodies[0].entity.name for link in groups[name]} for name in pair]
     assert found is not None
     assert any(found[k] in names[0] and found[1 - k] in names[1] for k in (0, 1)), found
+
+
+def test_where_overlap_is_not_reported_numbers_are_finite_and_nothing_is_a_success(monkeypatch: pytest.MonkeyPatch):
+    """As on a GPU: what was a success is one of `raw_success` alone."""
+    unknown = torch.full((4,), torch.nan)
+    seen: dict[bool, dict[str, Any]] = {}
+    for known in (True, False):
+        with monkeypatch.context() as patch:
+            if not known:
+                patch.setattr(OverlapMonitor, "take", lambda _: unknown.clone())
+            task = tasks.make_task("DoraCube-v1", 4, preset="none")
+            observation, _ = task.reset(seed=0)
+            for _ in range(task.max_steps):
+                assert observation.isfinite().all()
+                observation, reward, *_, info = task.step(torch.zeros(4, task.action_size))
+                assert reward.isfinite().all()
+            task.close()
+            seen[known] = info
+    assert seen[True]["success"].any()
+    assert seen[False]["raw_success"].equal(seen[True]["raw_success"])
+    assert not seen[False]["success"].any()
+    assert not seen[False]["nonfinite"].any()
+    assert seen[False]["penetration_mm"].isnan().all()
+
+
+@pytest.mark.parametrize("backend", ["physx_cuda", "gpu", "cuda:0"])
+def test_a_task_on_a_gpu_says_that_overlap_is_not_known(
+    backend: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    monkeypatch.setattr(options.logger, "propagate", True)
+    given: Any = ("none", None, 20, task_config(CubeConfig, "none", None), None, CubeTask.robots(), 2, None)
+    chosen = options.check_options(*given, backend, "none", None, "state")
+    assert chosen.sim_backend == backend
+    assert "does not report on a GPU how deep bodies overlap" in caplog.text
+
+
+def test_the_default_is_a_cpu_with_and_without_cuda(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    given: Any = ("none", None, 20, task_config(CubeConfig, "none", None), None, CubeTask.robots())
+    for count, backend in ((1, "physx_cpu"), (2, "physx_cpu_batch")):
+        assert options.check_options(*given, count, None, "auto", "none", None, "state").sim_backend == backend

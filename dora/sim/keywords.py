@@ -189,9 +189,9 @@ def _checked_robots(robots: Any) -> Any:
 def _check_backends(cls: type, kwargs: Mapping[str, Any]) -> None:
     name = kwargs.get("sim_backend", "auto")
     kind, _, device = name.partition(":")
-    if kind not in SIM_BACKENDS or (device and not (_cuda(kind) and device.isdigit())):
+    if kind not in SIM_BACKENDS or (device and not (on_gpu(kind) and device.isdigit())):
         raise InputError(f"there is no sim_backend {name!r}: {suggestion(name, SIM_BACKENDS)}")
-    if _cuda(kind) and not torch.cuda.is_available():
+    if on_gpu(kind) and not torch.cuda.is_available():
         raise InputError(f"sim_backend {name!r} needs a GPU with CUDA, and torch finds none: use {BACKEND!r}.")
     if _is_ours(cls) and kind in backends.CPU_SIM_BACKENDS and kwargs.get("num_envs", 1) > 1:
         raise InputError(f"sim_backend {name!r} runs one environment: use {BACKEND!r} for {kwargs['num_envs']}.")
@@ -201,8 +201,9 @@ def _check_backends(cls: type, kwargs: Mapping[str, Any]) -> None:
         raise InputError(f"there is no render_backend {render!r}: {suggestion(render, known)}")
 
 
-def _cuda(kind: str) -> bool:
-    return backends.sim_backend_name_mapping.get(kind) == "physx_cuda"
+def on_gpu(sim_backend: str) -> bool:
+    """Whether a value of `sim_backend` stands for PhysX on a GPU, with or without the number of a device."""
+    return backends.sim_backend_name_mapping.get(sim_backend.partition(":")[0]) == "physx_cuda"
 
 
 def _check_modes(cls: Any, kwargs: Mapping[str, Any]) -> None:

@@ -52,8 +52,8 @@ class DoraEnv(BaseEnv):
         grasps: candidates in place of those that come with Dora, of the task's object and robot; with several arms a
             dictionary by arm.
         robot_uids: name of a folder in `robots/`, or a tuple with one for each arm; the task's own by default.
-        sim_backend: as in ManiSkill; "auto" on a machine without CUDA is "physx_cpu", or "physx_cpu_batch" for
-            num_envs > 1.
+        sim_backend: as in ManiSkill; "auto" is "physx_cpu", or "physx_cpu_batch" for num_envs > 1, with and without
+            CUDA: on a GPU overlap is not known, so that no episode counts as a success.
         kwargs: everything else that `BaseEnv` takes.
 
     Raises:

@@ -5,14 +5,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from mani_skill import logger
 from mani_skill.agents.registration import REGISTERED_AGENTS
 
 from dora.affordance.candidates import GraspCandidates
 from dora.configs import check_finite, check_not_negative, check_ranges, overridden
 from dora.errors import InputError, shown
 from dora.robot import available_robots
-from dora.sim.batch.hooks import MOST_ENVS, check_room
+from dora.sim.batch.hooks import BACKEND, MOST_ENVS, check_room
 from dora.sim.batch.rendering import can_render, refuse_pictures, wants_pictures
+from dora.sim.keywords import on_gpu
 from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot
 from dora.sim.robots import register_robot
 from dora.tasks.mdp.config import TaskConfig
@@ -26,6 +28,11 @@ RATES = {
 """Lowest and highest rates [Hz], position iterations, of which PhysX takes 255, and shares."""
 SHARES = ("size", "mass", "hinge")
 """Half widths of the randomisation that are shares of what they change; a task may lack some."""
+NO_OVERLAP = (
+    "PhysX does not report on a GPU how deep bodies overlap: no episode counts as a success there (see raw_success in "
+    f"info), and overlap costs no reward. With sim_backend={BACKEND!r} it is known."
+)
+"""What is said of a task on a GPU."""
 MOST_DELAY = 1000
 """Largest delay of an action [control steps]."""
 
@@ -103,8 +110,8 @@ def check_options(
 ) -> TaskOptions:
     """Resolves defaults and refuses what cannot be built.
 
-    `sim_backend="auto"` is ManiSkill's choice where there is CUDA; otherwise "physx_cpu" for one environment and
-    "physx_cpu_batch" for more. `render_backend="auto"` is "none" unless a picture can be asked for.
+    `sim_backend="auto"` is "physx_cpu" for one environment and "physx_cpu_batch" for more, also where there is CUDA:
+    PhysX does not report overlap on a GPU. `render_backend="auto"` is "none" unless a picture can be asked for.
 
     Raises:
         InputError: one sentence about the first option that is wrong.
@@ -124,8 +131,10 @@ def check_options(
     known = [m + end for m in CONTROL_MODES for end in ("", COUPLED)]
     if mode not in known:
         raise InputError(f"unknown control mode {control_mode!r}; choose one of {', '.join(known)}")
-    if sim_backend == "auto" and not torch.cuda.is_available():
-        sim_backend = "physx_cpu_batch" if num_envs > 1 else "physx_cpu"
+    if sim_backend == "auto":
+        sim_backend = BACKEND if num_envs > 1 else "physx_cpu"
+    if on_gpu(sim_backend):
+        logger.warning(NO_OVERLAP)
     render_backend = choose_render_backend(render_backend, render_mode, obs_mode)
     return TaskOptions(parts, config, robots, mode, sim_backend, render_backend)
 

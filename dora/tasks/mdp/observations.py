@@ -158,7 +158,9 @@ ARM_ENTRIES: dict[str, Entry] = {
         lambda s: s.hand.touch.float(), "1", "contact of thumb, index, middle, ring, pinky, palm", sensed=True
     ),
     "max_penetration": Entry(
-        lambda s: s.max_penetration[:, None] * 1000, "mm", "largest overlap of the episode so far"
+        lambda s: (s.max_penetration[:, None] * 1000).nan_to_num(0.0),
+        "mm",
+        "largest overlap of the episode so far; 0 where the simulator does not report it",
     ),
     "stage": Entry(_stage, "1", "index of the active stage, of each arm if they have stages of their own"),
     "time": Entry(lambda s: s.time[:, None], "1", "share of the episode that is over", sensed=True),

@@ -67,8 +67,8 @@ def change(s: Snapshot) -> Float[Tensor, " n"]:
 
 
 def overlap(free: float, limit: float) -> Value:
-    """Term for overlap beyond `free`, in shares of `limit` [m]."""
-    return lambda s: ((s.penetration - free) / limit).clamp(0, 1)
+    """Term for overlap beyond `free`, in shares of `limit` [m]; 0 where the simulator does not report overlap (NaN)."""
+    return lambda s: ((s.penetration - free) / limit).clamp(0, 1).nan_to_num(0.0)
 
 
 def penalties(weights: Any, free: float, limit: float) -> dict[str, Term[Any]]:
