@@ -133,6 +133,15 @@ def test_policies_from_before_poses_were_filtered_meet_poses_as_measured():
     assert find_task(config.env).CONFIG.BY_PRESET["hard"]["pose_filter"] < 1
 
 
+def test_an_evaluation_under_another_preset_has_all_numbers_of_it():
+    for env_id in ("DoraJug-v1", "DoraMicrowave-v1"):
+        path = next(path for path in COMMITTED if path.parents[1].name == env_id and "hard" not in path.parent.name)
+        config = run.parse(f"--eval-only --checkpoint {path} --preset hard".split()).run
+        wanted = task_config(find_task(env_id).CONFIG, "hard", None)
+        assert config.task["randomisation"] == plain(wanted.randomisation)
+        assert config.task["pose_filter"] == wanted.pose_filter
+
+
 def test_settings_of_training_do_not_change_an_evaluation(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -10,7 +10,7 @@ import dora
 from dora.agents.runs.recommended import recommended
 from dora.configs import built, overridden, plain
 from dora.errors import InputError
-from dora.tasks import find_task, make_task, task_ids
+from dora.tasks import find_task, make_task, options_under_preset, task_ids
 from dora.tasks.cube import CubeConfig
 from dora.tasks.env.options import task_config
 from dora.tasks.hammer.task import HammerConfig
@@ -45,6 +45,23 @@ def test_fields_are_overridden_by_name_and_the_others_stay():
     assert changed == Outer(length=2.0, both=(1.0, 2.0), limit=0.5, inner=Inner(3.0))
     assert isinstance(changed.length, float)
     assert overridden(Outer(), Outer(count=5), "config") == Outer(count=5)
+
+
+@pytest.mark.parametrize("env_id", task_ids())
+@pytest.mark.parametrize("earlier", PRESETS)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_stored_numbers_under_another_preset_are_those_of_that_preset(env_id: str, earlier: str, preset: str):
+    cls = find_task(env_id).CONFIG
+    stored = {"preset": earlier, "config": plain(task_config(cls, earlier, None))}
+    wanted = {"preset": preset, "config": plain(task_config(cls, preset, None))}
+    assert options_under_preset(env_id, stored, preset) == wanted
+    assert options_under_preset(env_id, {"guidance": "none"}, preset) == {"guidance": "none", "preset": preset}
+
+
+def test_a_number_that_was_chosen_stays_under_another_preset():
+    own = {"pose_filter": 0.4, "lift": 0.12}
+    options = options_under_preset("DoraJug-v1", {"preset": "hard", "config": own}, "standard")
+    assert options["config"] == own
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,8 @@ import pytest
 import torch
 from live import Watched
 
+from dora.agents.runs.recommended import recommended
+from dora.commands import play
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_apply
 from dora.live.orders import Choose, Play, Push, Randomise, Repeat, Reset, Run, Speed, Start, Step
@@ -20,6 +22,8 @@ from dora.live.players import ZERO, Player, zero_correction
 from dora.live.reading import verdict
 from dora.live.session import Session
 from dora.live.status import ACTIVE, GOOD, QUIET, status
+from dora.policies.policy import TaskPolicy
+from dora.tasks import find_task
 
 BUSY = "busy"
 """A player that moves the fingers."""
@@ -248,7 +252,7 @@ def test_a_preset_is_in_force_from_the_next_episode_on(cube: Watched):
 
 def test_a_policy_keeps_its_numbers_of_the_task_under_another_preset():
     player = Player("policy", {"preset": "standard", "config": {"lift": 0.12, "randomisation": {"size": 0.5}}}, busy)
-    options = player.options_with("none")
+    options = player.options_with("DoraCube-v1", "none")
     assert options["preset"] == "none"
     assert options["config"]["lift"] == 0.12
     assert options["config"]["randomisation"]["size"] == 0.0
@@ -399,3 +403,24 @@ def test_nobody_who_acts_and_unknown_names_are_refused():
         Session("DoraCube-v1", [zero_correction({})], preset="standart")
     with pytest.raises(InputError, match="did you mean 'DoraCube-v1'"):
         Session("DoraCub-v1", [zero_correction({})])
+
+
+@pytest.mark.parametrize(
+    ("guidance", "parts", "offered"),
+    [
+        ("affordance", None, True), ("grasps", None, True), ("none", None, False),
+        ("affordance", ("observation", "reward"), False),
+    ],
+)  # fmt: skip
+def test_zero_correction_is_offered_where_there_is_a_reference_to_correct(
+    guidance: Any, parts: Any, offered: bool, monkeypatch: pytest.MonkeyPatch
+):
+    config = recommended("DoraCube-v1", "ppo", find_task("DoraCube-v1").LEARNERS, guidance=guidance)
+    config = replace(config, guidance_parts=parts)
+    policy = object.__new__(TaskPolicy)
+    policy.config = config
+    monkeypatch.setattr(play, "load_policy", lambda _: policy)
+    assert [player.name for player in play.find_players(play.Args("DoraCube-v1"))] == ["policy", ZERO][: 1 + offered]
+    if not offered:
+        with pytest.raises(InputError, match="without any"):
+            play.find_players(play.Args("DoraCube-v1", zero_correction=True))

@@ -29,7 +29,7 @@ from dora.live.page import Page
 from dora.live.players import Player, recorded, zero_correction
 from dora.live.recordings import Recording
 from dora.live.session import Session
-from dora.policies.policy import bundled_ids, load_policy
+from dora.policies.policy import TaskPolicy, bundled_ids, load_policy
 from dora.sim.batch.rendering import can_render
 from dora.tasks import check_task_id, make_task
 
@@ -67,7 +67,7 @@ class Args:
     """Episodes of the film."""
 
 
-def find_policy(env_id: str, checkpoint: Path | None) -> Player | None:
+def find_policy(env_id: str, checkpoint: Path | None) -> TaskPolicy | None:
     """The policy of a checkpoint, or the one that comes with a task; None if none does.
 
     Raises:
@@ -78,20 +78,21 @@ def find_policy(env_id: str, checkpoint: Path | None) -> Player | None:
     policy = load_policy(env_id if checkpoint is None else checkpoint)
     if policy.env_id != env_id:
         raise InputError(f"{checkpoint} is a policy of {policy.env_id}, not of {env_id}: name the task that it is of.")
-    return Player(POLICY, policy.env_kwargs, policy)
+    return policy
 
 
 def find_players(args: Args) -> list[Player]:
     """Who may act, the first one that which is asked for.
 
     Raises:
-        InputError: a file is missing, damaged, or of another task.
+        InputError: a file is missing, damaged, or of another task, or zero correction is asked for where a zero action
+            is no correction.
     """
     policy = find_policy(args.env, args.checkpoint)
-    players = [] if policy is None else [policy]
-    options = {} if policy is None else policy.options
-    if policy is None or options.get("guidance", "affordance") != "none":
-        players.insert(0 if args.zero_correction else len(players), zero_correction(options))
+    players = [] if policy is None else [Player(POLICY, policy.env_kwargs, policy)]
+    if policy is None or policy.config.has_prior:
+        zero = zero_correction({} if policy is None else policy.env_kwargs)
+        players.insert(0 if args.zero_correction else len(players), zero)
     elif args.zero_correction:
         raise InputError("--zero-correction needs guidance with a prior, and this policy was trained without any.")
     if args.recording is not None:
@@ -117,9 +118,8 @@ def film(args: Args, player: Player) -> Path:
             "No film: SAPIEN finds no Vulkan driver here (docs/rendering.md in the project); the page needs none."
         )
     make_folder(args.video.parent)
-    make = functools.partial(
-        make_task, args.env, 1, sim_backend="physx_cpu", render_mode="rgb_array", **player.options_with(args.preset)
-    )
+    options = player.options_with(args.env, args.preset)
+    make = functools.partial(make_task, args.env, 1, sim_backend="physx_cpu", render_mode="rgb_array", **options)
     record(make, player.act, args.video, args.episodes, args.seed)
     return args.video
 

@@ -38,7 +38,7 @@ from dora.agents.runs.trainer import Trainer
 from dora.configs import plain
 from dora.errors import FAILED, RECORDS, InputError, RunFailure, command
 from dora.tasks import find_task, make_task
-from dora.tasks.env.options import task_config
+from dora.tasks.env.options import numbers_under_preset, task_config
 from dora.tasks.mdp.guidance_parts import guidance_in_force
 from dora.tasks.mdp.randomisation import find_preset
 from dora.tools.command_line import HELP, read_some
@@ -156,7 +156,8 @@ def settings_to_start_from(first: First, words: Sequence[str]) -> RunConfig:
         config = read_checkpoint(checkpoint_path(first.checkpoint)).config
         if preset is None:
             return config
-        return replace(config, preset=preset, task=config.task | {"randomisation": plain(find_preset(preset))})
+        numbers = numbers_under_preset(find_task(config.env).CONFIG, config.task, config.preset, preset)
+        return replace(config, preset=preset, task=numbers)
     if first.checkpoint is not None:
         raise InputError("--checkpoint is only evaluated: add --eval-only, or go on with a run by --resume.")
     if first.env is None and not HELP & set(words):

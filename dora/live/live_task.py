@@ -82,7 +82,7 @@ class LiveTask:
         recorded = None
         if player.recording is not None:
             recorded = player.recording.episode(beginning.seed % len(player.recording.names))
-        self._make(player.options_with(beginning.preset))
+        self._make(player.options_with(self._env_id, beginning.preset))
         self.beginning, self._recorded, env = beginning, recorded, self.env
         env.chosen_start = self._placed
         env.narrow = {} if beginning.candidate is None else {env.arm.name: self._only}

@@ -8,9 +8,8 @@ from typing import Any
 
 from torch import Tensor
 
-from dora.configs import plain
 from dora.live.recordings import Recording
-from dora.tasks.mdp.randomisation import find_preset
+from dora.tasks import options_under_preset
 
 Act = Callable[[Tensor], Any]
 """Observation (1, o) -> action (1, a) in [-1, 1]."""
@@ -34,15 +33,9 @@ class Player:
     act: Act | None = None
     recording: Recording | None = None
 
-    def options_with(self, preset: str) -> dict[str, Any]:
+    def options_with(self, env_id: str, preset: str) -> dict[str, Any]:
         """Arguments of the task with another preset; a recording keeps what it was made with."""
-        if self.recording is not None:
-            return dict(self.options)
-        options = {**self.options, "preset": preset}
-        config = options.get("config")
-        if isinstance(config, Mapping) and "randomisation" in config:
-            options["config"] = {**config, "randomisation": plain(find_preset(preset))}
-        return options
+        return dict(self.options) if self.recording is not None else options_under_preset(env_id, self.options, preset)
 
 
 def zero_correction(options: Mapping[str, Any]) -> Player:

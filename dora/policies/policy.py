@@ -42,6 +42,8 @@ class TaskPolicy:
     def __init__(self, checkpoint: Checkpoint, path: Path, card: Card | None = None):
         self.config, self.card = checkpoint.config, card
         self.observation_size, self.action_size = checkpoint.sizes
+        self.env_steps: int = checkpoint.progress["env_steps"]
+        """Environment steps of the training until then."""
         self._networks = networks_of(checkpoint, path)
         self._device = torch.device("cpu")
 

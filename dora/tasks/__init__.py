@@ -2,12 +2,14 @@
 
 import importlib
 import pkgutil
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
 
 from dora.errors import InputError, suggestion
 from dora.tasks.env.env import DoraEnv
+from dora.tasks.env.options import numbers_under_preset
 from dora.tasks.env.registration import TASKS
 from dora.tasks.env.task import Task
 
@@ -41,6 +43,18 @@ def find_task(env_id: str) -> type[Task]:
     """
     check_task_id(env_id)
     return TASKS[env_id]
+
+
+def options_under_preset(env_id: str, options: Mapping[str, Any], preset: str) -> dict[str, Any]:
+    """Arguments of a task under another preset than theirs, which stands in the numbers of their `config` as well.
+
+    Raises:
+        InputError: for an unknown id or preset.
+    """
+    config = options.get("config") or {}
+    earlier = options.get("preset", "standard")
+    numbers = numbers_under_preset(find_task(env_id).CONFIG, config, earlier, preset)
+    return {**options, "preset": preset, **({"config": numbers} if numbers else {})}
 
 
 def make_task(env_id: str, num_envs: int, guidance: str = "affordance", **options: Any) -> DoraEnv:

@@ -9,7 +9,7 @@ from mani_skill import logger
 from mani_skill.agents.registration import REGISTERED_AGENTS
 
 from dora.affordance.candidates import GraspCandidates
-from dora.configs import check_finite, check_not_negative, check_ranges, overridden
+from dora.configs import check_finite, check_not_negative, check_ranges, overridden, plain
 from dora.errors import InputError, shown
 from dora.robot import available_robots
 from dora.sim.batch.hooks import BACKEND, MOST_ENVS, check_room
@@ -82,6 +82,23 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Any, sim_config: An
             f"config.control_frequency, {config.control_frequency} Hz."
         )
     return config
+
+
+def numbers_under_preset(
+    cls: type[TaskConfig], numbers: Mapping[str, Any], earlier: str, preset: str
+) -> dict[str, Any]:
+    """Numbers of a task, as plain data and perhaps not all of them, under another preset.
+
+    The randomisation becomes that of the preset, and so does a number that presets bring (`BY_PRESET`) where it has the
+    value of the earlier one. What is not there stays away: an environment takes it from its preset.
+
+    Raises:
+        InputError: for an unknown preset.
+    """
+    before, after = (plain(task_config(cls, name, None)) for name in (earlier, preset))
+    brought = {"randomisation", *cls.BY_PRESET.get(earlier, {}), *cls.BY_PRESET.get(preset, {})}
+    changed = {k for k in brought & numbers.keys() if k == "randomisation" or numbers[k] == before[k]}
+    return {**numbers, **{name: after[name] for name in changed}}
 
 
 def _with_rates(config: TaskConfig, sim_config: Any) -> TaskConfig:
