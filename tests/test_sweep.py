@@ -15,13 +15,15 @@ from fake_run import PARENT, STARTS, fake_words
 from rich.console import Console
 
 import dora.sweeps.sweep
+from dora.affordance.bundled_sets import bundled_path
 from dora.commands import run
 from dora.commands import sweep as command
 from dora.errors import InputError
 from dora.sweeps.board import Board, duration, summary
-from dora.sweeps.launching import LOG, LocalLauncher, is_locked, progress_of, resuming
+from dora.sweeps.launching import LOG, LocalLauncher, is_locked, resuming, steps_of
 from dora.sweeps.plan import MECHANISM, Row, rows_of
 from dora.sweeps.sweep import State, Sweep
+from dora.tasks import find_task
 
 
 def fake(mode: str) -> LocalLauncher:
@@ -69,11 +71,14 @@ def nothing(*_: object) -> None:
 def test_the_papers_tables_and_the_ladder_are_planned():
     rows = rows_of("paper")
     parts = {title: sum(row.title == title for row in rows) for title in {row.title for row in rows}}
-    assert parts == {"Table I": 36, "Table IV": 12, "ladder": 18}
-    assert len({row.name for row in rows}) == len({row.config.digest() for row in rows}) == 66
+    assert parts == {"Table I": 36, "Table IV": 12, "ladder": 15}
+    assert len({row.name for row in rows}) == len({row.config.digest() for row in rows}) == 63
     assert [row.config.seed for row in rows] == sorted(row.config.seed for row in rows)
     assert {row.config.guidance_parts for row in rows} == {None, MECHANISM}
     assert all(row.config.final_episodes == 500 for row in rows)
+    for row in rows:
+        for arm in find_task(row.config.env).ARMS.values():
+            assert bundled_path(arm.object, region=row.config.guidance != "grasps").exists(), row.name
 
 
 @pytest.mark.parametrize("index", [0, 9, 13, 19])
@@ -130,6 +135,30 @@ def test_zero_correction_is_evaluated_once_for_all_seeds_and_learners(tmp_path: 
     assert resuming(tmp_path, zero=False) == [*resuming(tmp_path), "--no-zero-correction"]
 
 
+def test_a_run_that_leaves_zero_correction_out_does_not_count_for_another_one(tmp_path: Path):
+    """The first run evaluates it, and fails; while it is repeated, the second one is trained without."""
+    rows = rows_of("paper", envs=["DoraCube-v1"], agents=["ppo"], guidance=["affordance"], seeds=[10, 11])
+    asked: list[tuple[int, bool]] = []
+
+    class Noting(LocalLauncher):
+        def start(self, row: Row, folder: Path, zero: bool) -> None:
+            asked.append((row.config.seed, zero))
+            super().start(row, folder, zero)
+
+    modes = {10: "fails-once", 11: "slow"}
+    by_seed = {str(tmp_path / row.name): modes[row.config.seed] for row in rows}
+    sweep = Sweep(rows, tmp_path, jobs=2)
+    sweep.run(Noting(lambda folder, zero: fake_words(folder, by_seed[str(folder)])), nothing, nothing)
+    assert asked == [(10, True), (11, False), (10, True)]
+
+
+def test_a_run_that_was_good_enough_early_shows_the_steps_that_it_took(tmp_path: Path):
+    (row,) = few(1)
+    result(row, tmp_path / "known" / "early", env_steps=1234)
+    (entry,) = Sweep([row], tmp_path / "out", [tmp_path / "known"]).entries
+    assert (entry.state, entry.env_steps, entry.seconds_left) == (State.DONE, 1234, 0.0)
+
+
 def test_time_that_is_left_is_that_of_runs_of_the_same_kind(tmp_path: Path):
     rows = few(3)
     result(rows[0], tmp_path / "known" / "one")  # ten minutes
@@ -179,7 +208,7 @@ def test_ctrl_c_lets_runs_save_and_the_same_call_goes_on(tmp_path: Path):
     sweep, turns = Sweep(few(1), tmp_path), []
 
     def check() -> None:
-        turns.append(progress_of(sweep.entries[0].folder)[0])
+        turns.append(steps_of(sweep.entries[0].folder))
         if turns[-1] > 0:
             raise KeyboardInterrupt
 
@@ -208,7 +237,7 @@ def test_a_sweep_that_is_killed_loses_nothing(tmp_path: Path):
     first = few(1)[0]
     process = subprocess.Popen([sys.executable, "-c", SCRIPT, str(Path(__file__).parent), str(tmp_path)])
     deadline = time.monotonic() + 60
-    while progress_of(tmp_path / first.name)[0] == 0 and time.monotonic() < deadline:
+    while steps_of(tmp_path / first.name) == 0 and time.monotonic() < deadline:
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()

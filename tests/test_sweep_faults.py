@@ -5,10 +5,13 @@ import os
 from pathlib import Path
 
 import pytest
+from fake_run import fake_words
 from test_sweep import fake, few, nothing, result, starts, states
 
 import dora.sweeps.sweep
 from dora.agents.runs.run_folder import RunFolder
+from dora.configs import plain
+from dora.sweeps import ray_cluster
 from dora.sweeps.launching import NOT_THE_RUN, LocalLauncher, prepare
 from dora.sweeps.plan import rows_of
 from dora.sweeps.sweep import State, Sweep
@@ -31,6 +34,21 @@ def test_a_run_of_a_smaller_budget_is_gone_on_with_up_to_the_larger_one(tmp_path
     assert states(sweep) == [State.DONE]
     assert starts(sweep) == [2]
     assert RunFolder(sweep.entries[0].folder).read_config().total_steps == 2000
+
+
+def test_a_cluster_goes_on_with_a_run_of_a_smaller_budget_too(tmp_path: Path):
+    seen = []
+
+    def command(folder: Path, zero: bool) -> list[str]:
+        seen.append(RunFolder(folder).read_config().total_steps)
+        return fake_words(folder, "well")
+
+    for steps in (1000, 2000, 2000):
+        (row,) = short_rows(steps)
+        (tmp_path / row.name).mkdir(parents=True, exist_ok=True)
+        (tmp_path / row.name / "seen").touch()
+        ray_cluster.train_there(str(tmp_path / row.name), "seen", plain(row.config), command)
+    assert seen == [1000, 2000]
 
 
 def test_a_run_of_a_larger_budget_is_another_one(tmp_path: Path):

@@ -112,21 +112,20 @@ def last_words(folder: Path) -> str:
     return next((line.strip() for line in reversed(lines) if line.strip()), "it printed nothing")
 
 
-def progress_of(folder: Path) -> tuple[int, float]:
-    """Environment steps and seconds of training that a run has taken, from the last whole row of its progress.csv."""
+def steps_of(folder: Path) -> int:
+    """Environment steps that a run has taken, from the last whole row of its progress.csv."""
     path = folder / "progress.csv"
     if not path.exists():
-        return 0, 0.0
+        return 0
     with path.open("rb") as file:
         file.seek(max(path.stat().st_size - TAIL, 0))
         lines = file.read().decode(errors="replace").split("\n")[:-1]
     for line in reversed(lines):
-        cells = line.split(",")
         try:
-            return int(cells[0]), float(cells[1])
-        except (ValueError, IndexError):
+            return int(line.split(",")[0])
+        except ValueError:
             continue
-    return 0, 0.0
+    return 0
 
 
 def complaint(folder: Path, status: int) -> str | None:

@@ -19,7 +19,8 @@ from dora.agents.config import config_from_dict
 from dora.configs import plain
 from dora.errors import InputError
 from dora.files import write_bytes
-from dora.sweeps.launching import LOG, Command, Launcher, complaint, is_finished, is_locked, prepare, resuming
+from dora.sweeps.finished import finished_runs, result_of
+from dora.sweeps.launching import LOG, Command, Launcher, complaint, is_locked, prepare, resuming
 from dora.sweeps.plan import WORKERS, Row
 
 SENT = (
@@ -133,7 +134,7 @@ def train_there(
     prepare(row, place)
     while is_locked(place):  # the process of a worker that died goes on with the run
         time.sleep(LOCK_SECONDS)
-    if not is_finished(place):
+    if result_of(row, finished_runs([place], strict=False)) is None:  # none yet, or one of a smaller budget
         status = _trained(place, command(place, zero))
         if wrong := complaint(place, status):
             raise RuntimeError(wrong)

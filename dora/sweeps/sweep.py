@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dora.errors import InputError
 from dora.sweeps.finished import Finished, finished_runs, result_of, seconds_per_step
-from dora.sweeps.launching import NOT_THE_RUN, Launcher, check_folder, is_finished, is_locked, prepare, progress_of
+from dora.sweeps.launching import NOT_THE_RUN, Launcher, check_folder, is_finished, is_locked, prepare, steps_of
 from dora.sweeps.plan import Row
 
 POLL_SECONDS = 1.0
@@ -25,10 +25,6 @@ class State(Enum):
     FAILED = "failed"
 
 
-UNDER_WAY = (State.RUNNING, State.ELSEWHERE)
-"""States of runs that are being trained."""
-
-
 @dataclass
 class Entry:
     """A run of a sweep and how it stands.
@@ -42,6 +38,8 @@ class Entry:
         complaint: what went wrong last.
         success_rate: of a finished run.
         seconds: wall time of a finished run [s].
+        taken: environment steps of a finished run, fewer than its budget if it was good enough early.
+        zero: it was begun here, and evaluates zero correction at its end.
     """
 
     row: Row
@@ -52,11 +50,18 @@ class Entry:
     complaint: str = ""
     success_rate: float | None = None
     seconds: float | None = None
+    taken: int = 0
+    zero: bool = False
+
+    @property
+    def under_way(self) -> bool:
+        """Whether it is being trained, here or elsewhere."""
+        return self.state in (State.RUNNING, State.ELSEWHERE)
 
     @property
     def env_steps(self) -> int:
         """Environment steps that were taken."""
-        return self.row.config.total_steps if self.state is State.DONE else progress_of(self.folder)[0]
+        return self.taken if self.state is State.DONE else steps_of(self.folder)
 
     @property
     def seconds_left(self) -> float:
@@ -150,10 +155,9 @@ class Sweep:
         for entry in self.entries:
             if entry.state in (State.WAITING, State.ELSEWHERE):
                 locked = is_locked(entry.folder)
+                entry.state = State.ELSEWHERE if locked else State.WAITING
                 if not locked and is_finished(entry.folder):
                     self._settle(entry, self._found())
-                else:
-                    entry.state = State.ELSEWHERE if locked else State.WAITING
 
     def _begin(self, launcher: Launcher) -> None:
         """Begins as many runs as there is room for."""
@@ -163,7 +167,8 @@ class Sweep:
             if entry.state is State.WAITING:
                 try:
                     prepare(entry.row, entry.folder)
-                    launcher.start(entry.row, entry.folder, not self._has_zero(entry))
+                    entry.zero = not self._has_zero(entry)
+                    launcher.start(entry.row, entry.folder, entry.zero)
                 except (InputError, OSError) as error:  # its folder is no good; the others may be
                     entry.state, entry.complaint = State.FAILED, str(error)
                 else:
@@ -174,7 +179,7 @@ class Sweep:
         there and with whatever seed, it is the same, and reports take it from there."""
         alike = (other for other in self.entries if other.row.same_zero(entry.row) and other is not entry)
         return any(
-            (other.folder / "zero.csv").is_file() if other.state is State.DONE else other.state in UNDER_WAY
+            (other.folder / "zero.csv").is_file() if other.state is State.DONE else other.under_way and other.zero
             for other in alike
         )
 
@@ -183,4 +188,4 @@ class Sweep:
         one = result_of(entry.row, found)
         if one is not None:
             entry.state, entry.folder = State.DONE, one.folder
-            entry.success_rate, entry.seconds = one.success_rate, one.seconds
+            entry.success_rate, entry.seconds, entry.taken = one.success_rate, one.seconds, one.env_steps
