@@ -1,7 +1,7 @@
 """Configurations as frozen dataclasses: overriding fields by name, and reading them back from plain data, checked."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar, get_type_hints
 
 import dacite
@@ -37,6 +37,15 @@ def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         return plain(value)
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
+
+
+def flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Names with dots, as on the command line, and values of nested plain data; `before` stands before every name."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{before}{name}.")
+        else:
+            yield before + name, value
 
 
 def overridden(config: C, changes: Any, what: str) -> C:

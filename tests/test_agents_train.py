@@ -171,6 +171,22 @@ def test_the_rate_that_is_shown_is_steps_over_time(tmp_path: Path, capfd: pytest
     assert all(0 < rate < 1e8 for rate in shown)
 
 
+def test_time_spent_with_saving_is_time_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """So are the moments in which other programs are looked at, of which the share is one of the same time."""
+    saved, save = [], Trainer.save
+
+    def slowly(trainer: Trainer) -> None:
+        time.sleep(0.2)
+        saved.append(save(trainer))
+
+    monkeypatch.setattr(Trainer, "save", slowly)
+    start = time.perf_counter()
+    result = run(tmp_path / "run", dataclasses.replace(BASE, total_steps=2_000, checkpoint_seconds=0.0))
+    passed = time.perf_counter() - start
+    assert len(saved) > 2
+    assert 0.2 * len(saved) < result["wall_seconds"] < passed
+
+
 @pytest.mark.slow
 def test_batches_collected_ahead_are_of_the_policy_before():
     learner = PPO(dataclasses.replace(SMALL_PPO, log_std=-3.0), 4, 2, 1000)

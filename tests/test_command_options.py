@@ -23,7 +23,7 @@ EVALUATION = f"--eval-only --checkpoint {RESULTS}/policy.safetensors"
 HUGE = "1" + "0" * 30
 NUMBERS = {
     "seed": ("-1", HUGE), "total-steps": ("0", "-5", HUGE), "num-envs": ("0", HUGE), "workers": ("-1", HUGE),
-    "learner-threads": ("0", HUGE), "eval-every": ("0", HUGE), "eval-episodes": ("0", HUGE), "episodes": ("0", HUGE),
+    "learner-threads": ("0", HUGE), "eval-every": ("0", HUGE), "eval-episodes": ("0", HUGE), "episodes": ("0", "10001"),
     "eval-envs": ("0", HUGE), "stop-success": ("2", "-0.1", "nan"), "checkpoint-seconds": ("-1", "nan", "inf"),
     "normaliser-samples": ("-1", HUGE), "learner.rollout": ("0", HUGE), "learner.epochs": ("0", HUGE),
     "learner.minibatch": ("0",), "learner.gamma": ("nan", "-1", "2"), "learner.gae-lambda": ("1.1",),

@@ -1,6 +1,7 @@
 """Numbers of tasks as configuration: overridden by name, checked, shown, and in force."""
 
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import gymnasium as gym
 import pytest
@@ -12,6 +13,7 @@ from dora.configs import built, overridden, plain
 from dora.errors import InputError
 from dora.tasks import find_task, make_task, options_under_preset, task_ids
 from dora.tasks.cube import CubeConfig
+from dora.tasks.env.description import config_rows
 from dora.tasks.env.options import task_config
 from dora.tasks.hammer.task import HammerConfig
 from dora.tasks.jug import JugConfig
@@ -45,6 +47,16 @@ def test_fields_are_overridden_by_name_and_the_others_stay():
     assert changed == Outer(length=2.0, both=(1.0, 2.0), limit=0.5, inner=Inner(3.0))
     assert isinstance(changed.length, float)
     assert overridden(Outer(), Outer(count=5), "config") == Outer(count=5)
+
+
+def test_numbers_are_shown_as_an_override_takes_them():
+    """Switches, too: every value of the table, given back as an option, is the number in force."""
+    config = replace(task_config(CubeConfig, "standard", None), optimised=True)
+    shown = dict(config_rows(SimpleNamespace(config=config))[1:])
+    assert shown["optimised"] == "True"
+    assert shown["centre"] == "0.55, 0"
+    again = overridden(config, {"optimised": shown["optimised"] == "True"}, "config")
+    assert again == config
 
 
 @pytest.mark.parametrize("env_id", task_ids())

@@ -72,6 +72,7 @@ def script() -> ModuleType:
         ("--refine-in-task --object cube --seed 3", "--seed 3 is for searches"),
         ("--refine-in-task --object microwave", "DoraMicrowave-v1 has several arms"),
         ("--contact-maps --object cube --any-region", "--any-region True is for searches"),
+        ("--contact-maps --rank-in-task --object cube", "--contact-maps goes alone"),
         ("--object cube --any-region", "a search takes --region any"),
         ("--rank-in-task --object spoon", "no object 'spoon'"),
         ("--rank-in-task --any-region --object microwave", "DoraMicrowave-v1 has several arms"),
@@ -186,6 +187,16 @@ def test_contact_maps_of_a_folder(
     again = GraspCandidates.load(folder / "grasps.safetensors")
     assert (again.contact_map == bundled.contact_map).float().mean() > 0.9999
     assert torch.equal(again.grasp, bundled.grasp)
+
+
+def test_what_is_done_together_takes_the_options_of_both(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    done = []
+    monkeypatch.setattr(script, "rank_bundled_set", lambda *_: done.append("ranked") or [])
+    monkeypatch.setattr(script, "refine_bundled_set", lambda *given: done.append(given[-1].seat) or [])
+    assert call(script, monkeypatch, *["--rank-in-task", "--refine-in-task", "--object", "cube", "--seat", "0.1"]) == 0
+    assert done == ["ranked", 0.1]
 
 
 def test_interruption_leaves_nothing(

@@ -9,6 +9,7 @@ import torch
 from commands import call
 
 from dora.agents.config import PPOConfig, RunConfig, SACConfig
+from dora.agents.learners import benchmark
 from dora.agents.learners.benchmark import made_up_batch, measure
 from dora.agents.learners.plain_torch import PlainPPO, PlainSAC, plain_batch
 from dora.agents.learners.ppo import PPO
@@ -73,6 +74,27 @@ def test_both_are_timed(agent: str):
     assert speed.ratio == pytest.approx(speed.updates_per_second / speed.reference_updates_per_second)
     assert speed.samples_per_second == pytest.approx(speed.updates_per_second * (64 if agent == "ppo" else 32))
     assert (speed.observation, speed.action, speed.transitions) == (*SIZES, 128)
+
+
+def test_every_update_of_sac_that_is_counted_takes_all_its_steps(monkeypatch: pytest.MonkeyPatch):
+    """Also with the settings of the tasks, whose warm-up is longer than the updates that are not counted."""
+    learners, taken = list[SAC](), list[int]()
+
+    def made(*given: Any) -> SAC:
+        learners.append(SAC(given[0].learner, *given[1:], normaliser_samples=1000))
+        return learners[0]
+
+    def counted(update: Any, seconds: float, before: int) -> float:
+        steps = learners[0].updates
+        update()
+        taken.append(learners[0].updates - steps)
+        return 1.0
+
+    monkeypatch.setattr(benchmark, "make_learner", made)
+    monkeypatch.setattr(benchmark, "_updates_per_second", counted)
+    speed = measure(config_of("sac", warmup=4000, critic_only=500, updates_per_step=1 / 8), *SIZES, 1.0)
+    assert taken == [speed.transitions / 8, 0] * benchmark.TURNS  # the other side's updates are not the learner's
+    assert speed.updates_per_second == speed.transitions / 8
 
 
 def test_the_command_prints_the_agreed_keys(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):

@@ -34,7 +34,9 @@ def test_each_row_is_there_at_once_and_unknown_values_are_empty(tmp_path: Path):
     assert columns["stage/lift"][1] == 0.5
 
 
-@pytest.mark.parametrize("torn", ["300,3.", "300,3,0,,,,\n", "300,3\x00\x00,0,,,,,\n", "400"])
+@pytest.mark.parametrize(
+    "torn", ["300,3.", "300,3,0,,,,\n", "300,3\x00\x00,0,,,,,\n", "400", "," * len(COLUMNS) + "\n"]
+)
 def test_a_torn_last_row_is_left_out_and_mended(tmp_path: Path, torn: str):
     path = tmp_path / "progress.csv"
     table = ProgressTable(path, ["reach"])

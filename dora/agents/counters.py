@@ -9,7 +9,7 @@ from dora.configs import LARGEST, built, check_ranges
 from dora.errors import InputError, shown
 
 PHASES = ("collect", "learn", "evaluate")
-"""What the time of a run is spent with."""
+"""What most of the time of a run is spent with."""
 LEARNER = "learner"
 """Entry of a checkpoint's counters with those of its learner, by name."""
 COLUMNS = 3
@@ -26,6 +26,7 @@ class Counters:
 
     env_steps: int = 0
     wall_seconds: float = 0.0
+    """Wall time of the run: start of the workers, collecting, learning, evaluating, saving [s]."""
     episodes: int = 0
     next_evaluation: int = 0
     best: list[float] | None = None
@@ -38,6 +39,7 @@ class Counters:
     other_seconds: float = 0.0
     """Processor time that other programs took meanwhile [s]."""
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PHASES, 0.0))
+    """Wall time of each of `PHASES` [s]."""
 
 
 def checked_counters(progress: Mapping[str, Any], path: Path) -> Counters:

@@ -3,6 +3,7 @@
 import itertools
 
 from dora.agents.config import RunConfig, SACConfig
+from dora.agents.seeds import STARTS
 from dora.arguments import LARGEST_SEED
 from dora.configs import check_finite, check_ranges
 from dora.errors import InputError
@@ -25,7 +26,7 @@ RUN = {
     "learner_threads": (1, 512),
     "eval_every": (1, 10**12),
     "eval_episodes": (1, 100_000),
-    "final_episodes": (1, 1_000_000),
+    "final_episodes": (1, STARTS),
     "eval_envs": (1, 100_000),
     "stop_success": (0, 1),
     "after_success": (0, 10**12),
@@ -33,8 +34,8 @@ RUN = {
     "normaliser_samples": (0, 10**12),
 }
 """Lowest and highest value of the settings of a run."""
-SHARE, RATE, LOGARITHM = (0, 1), (1e-12, 1e3), (-30, 10)
-"""Lowest and highest share, rate or norm, and logarithm of a deviation."""
+SHARE, RATE = (0, 1), (1e-12, 1e3)
+"""Lowest and highest share, and rate or norm."""
 LEARNER = {
     "rollout": (1, 100_000),
     "epochs": (1, 10_000),
@@ -65,9 +66,9 @@ LEARNER = {
     "prior_last": (1e-12, 1e6),  # it is reached geometrically
     "prior_steps": (1, 10**12),
     "target_entropy": (-1e6, 1e6),
-    "log_std": LOGARITHM,
-    "log_std_min": LOGARITHM,
-    "log_std_max": LOGARITHM,
+    "log_std": (-30, 0),  # PPO's noise never grows beyond the range of actions
+    "log_std_min": (-30, 0),
+    "log_std_max": (-30, 10),
 }
 """Lowest and highest value of the settings of learners."""
 ORDERED = (("learning_rate_min", "learning_rate_max"), ("log_std_min", "log_std"))

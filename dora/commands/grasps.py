@@ -227,13 +227,16 @@ def remake(args: Args) -> None:
     asked = [f"--{name.replace('_', '-')}" for name in TAKEN]
     if args.object is None or args.mesh is not None:
         raise InputError(f"{', '.join(asked)} need --object, for example --object jug, and no --mesh.")
-    used = TAKEN[next(name for name in TAKEN if getattr(args, name))]
+    given = [name for name in TAKEN if getattr(args, name)]
+    if args.contact_maps and len(given) > 1:
+        raise InputError("--contact-maps goes alone: sets that are made, ranked or refined get their maps anyway.")
+    used = {option for name in given for option in TAKEN[name]}
     for field in fields(args):
         if field.name not in ("object", *TAKEN, *used) and (value := getattr(args, field.name)) != field.default:
             option = f"--{field.name.replace('_', '-')}"
             raise InputError(f"{option} {value} is for searches, not for {', '.join(asked)}: leave it out.")
     name = args.object
-    if args.contact_maps and not (args.make_bundle or args.rank_in_task or args.refine_in_task):
+    if args.contact_maps:
         path, agreement = map_bundled_set(name)
         print_agreement(agreement)
         print(path)
@@ -262,6 +265,6 @@ def main() -> int:
         else:
             run(args)
     except KeyboardInterrupt:
-        print("Interrupted; nothing was written.", file=sys.stderr)
+        print("Interrupted; nothing was written but what is named above.", file=sys.stderr)
         return INTERRUPTED
     return 0

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from dora.agents.collecting.task_env import EpisodeColumns, TaskEnv
+from dora.agents.seeds import STARTS
 from dora.errors import InputError
 from dora.tables import share_text, wilson
 
@@ -17,8 +18,6 @@ PERIODIC_SEED = 1_000_000_000
 """Seed of the first episode of evaluations during training; all training seeds are smaller."""
 FINAL_SEED = 1_500_000_000
 """Seed of the first episode of the evaluation at the end of training."""
-STARTS = 10_000
-"""Seeds that belong to each `--seed` of an evaluation [1]; so many episodes have starts of their own."""
 MOST_SEEDS = 200_000
 """Values of `--seed` whose starts have seeds that NumPy takes [1]: all are below 2^32."""
 

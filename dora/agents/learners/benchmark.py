@@ -2,12 +2,12 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDict
 
-from dora.agents.config import RunConfig
+from dora.agents.config import RunConfig, SACConfig
 from dora.agents.learners.learner import make_learner
 from dora.agents.learners.plain_torch import PlainPPO, PlainSAC, plain_batch
 from dora.agents.learners.ppo import PPO
@@ -72,6 +72,9 @@ def made_up_batch(config: RunConfig, observation: int, action: int, seed: int = 
 def measure(config: RunConfig, observation: int, action: int, seconds: float) -> LearnerSpeed:
     """Times the updates of a run's learner and those of the same in plain torch, in turn.
 
+    SAC learns from its first batch on, and its actor from the first gradient step, so that every update that is counted
+    takes the steps of one in the middle of a run.
+
     Args:
         config: settings of the run; its learner is PPO or SAC.
         observation, action: numbers of components of the task.
@@ -84,6 +87,8 @@ def measure(config: RunConfig, observation: int, action: int, seconds: float) ->
         raise InputError(f"There is no reference of {config.agent}: use --agent with one of {', '.join(REFERENCES)}.")
     torch.set_num_threads(config.learner_threads)
     torch.manual_seed(0)
+    if isinstance(config.learner, SACConfig):
+        config = replace(config, learner=replace(config.learner, warmup=0, critic_only=0))
     learner = make_learner(config, observation, action)
     batch = made_up_batch(config, observation, action)
     if isinstance(learner, SAC):

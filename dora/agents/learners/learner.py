@@ -21,7 +21,11 @@ class Learner(Protocol):
     """What the training loop needs of an algorithm."""
 
     policy: Policy
+    """Acts while transitions are collected."""
+    evaluated: Policy
+    """Is evaluated and kept: `policy`, or an average of it."""
     rollout: int
+    """Control steps per environment and batch."""
 
     @property
     def replay(self) -> Replay | None:

@@ -1,7 +1,7 @@
 """Finished runs as they lie in folders, and which of them make one row of a report."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from dora.agents.config import NEUTRAL, NEUTRAL_LEARNER
 from dora.agents.evaluation.evaluate import FINAL_SEED
 from dora.agents.runs.progress_table import read_progress
 from dora.agents.runs.stored_results import check_agreement, read_curve, read_episodes, read_result
+from dora.configs import flat
 from dora.errors import InputError
 
 DEFAULT_PRESET = "standard"
@@ -100,7 +101,7 @@ def _with_zero(runs: Sequence[Run]) -> list[Run]:
     def starts(run: Run) -> tuple[Any, ...]:
         r = run.result
         first = r.get("first_seed", FINAL_SEED), r.get("eval_episodes", 0)
-        return r["env"], run.group[1], run.group[3], str(sorted(_flat(NEUTRAL | (r.get("task_config") or {})))), *first
+        return r["env"], run.group[1], run.group[3], str(sorted(flat(NEUTRAL | (r.get("task_config") or {})))), *first
 
     measured = {starts(run): run for run in runs if run.result["zero_success_rate"] is not None}
     filled = []
@@ -139,7 +140,7 @@ def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Runs by what the numbers of their task differ in, in words: by switches alone where these tell them apart."""
     known = all("learner_config" in run.result for run in runs)  # results of earlier versions lack it
     numbers = [
-        dict(_flat(NEUTRAL | (run.result.get("task_config") or {}))) | (_learner(run) if known else {}) for run in runs
+        dict(flat(NEUTRAL | (run.result.get("task_config") or {}))) | (_learner(run) if known else {}) for run in runs
     ]
     names = sorted({name for each in numbers for name in each})
     different = [name for name in names if len({str(each.get(name)) for each in numbers}) > 1]
@@ -164,15 +165,6 @@ def _learner(run: Run) -> dict[str, Any]:
     """Settings of the learner by name."""
     settings = NEUTRAL_LEARNER.get(run.result["agent"], {}) | (run.result["learner_config"] or {})
     return {f"learner.{name}": value for name, value in settings.items()}
-
-
-def _flat(numbers: dict[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Names with dots, and values, of nested numbers."""
-    for name, value in numbers.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{before}{name}.")
-        else:
-            yield before + name, value
 
 
 def success_shares(runs: Sequence[Run]) -> list[tuple[float, int]]:

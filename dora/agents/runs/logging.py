@@ -13,7 +13,7 @@ from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from dora.agents.config import RunConfig
-from dora.configs import plain
+from dora.configs import flat, plain
 from dora.tables import markdown_table
 
 TAGS: dict[str, str] = {
@@ -48,7 +48,7 @@ TAGS: dict[str, str] = {
     "learner/learning_rate": "learning rate (PPO adapts it to the divergence)",
     "learner/grad_norm": "norm of the gradient before clipping (of the actor)",
     "learner/action_std": "mean standard deviation of the exploration noise (SAC: before the tanh)",
-    "learner/correction": "root mean square of the mean action over the batch (SAC: before the tanh)",
+    "learner/correction": "root mean square of the mean action over the batch (SAC: after the tanh)",
     "learner/explained_variance": "PPO: 1 - Var(target - value) / Var(target); 1 is perfect",
     "learner/factor_std/<agent>": "HAPPO: deviation of the compounded ratio by which its advantages are multiplied",
     "learner/<value>/<agent>": (
@@ -143,17 +143,7 @@ class RunLog:
 
 def flat_settings(config: RunConfig) -> dict[str, str | float | bool]:
     """Settings of a run by their names on the command line; what is no number, text or bool is written as text."""
-    flat: dict[str, str | float | bool] = {}
-
-    def add(prefix: str, values: Mapping[str, Any]) -> None:
-        for name, value in values.items():
-            if isinstance(value, Mapping):
-                add(f"{prefix}{name}.", value)
-            else:
-                flat[prefix + name] = value if isinstance(value, str | float | int | bool) else str(value)
-
-    add("", plain(config))
-    return flat
+    return {name: v if isinstance(v, str | float | int | bool) else str(v) for name, v in flat(plain(config))}
 
 
 def add_film(folder: Path, film: Path, step: int) -> None:

@@ -45,7 +45,7 @@ def _whole_rows(path: Path, most: int) -> tuple[list[str], list[list[str]]]:
     rows = []
     for line in lines[1:]:
         cells = line.split(",")
-        if len(cells) != len(header) or not all(map(_is_cell, cells)):
+        if len(cells) != len(header) or not cells[0] or not all(map(_is_cell, cells)):
             break
         rows.append(cells)
     return header, rows

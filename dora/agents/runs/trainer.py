@@ -111,7 +111,7 @@ class Trainer:
                 case the state is saved; `result.json` has `finished` false.
         """
         evaluation, zero, finished = None, None, False
-        self._others = OtherLoad()
+        self._others, self._looked = OtherLoad(), time.perf_counter()
         with Interrupt() as interrupt:
             self.folder.mark_unfinished()
             log = RunLog(self.folder.path, self.counters.env_steps, self.config)
@@ -205,8 +205,9 @@ class Trainer:
             ended = ended_episodes(batch["next", "done"], batch["next", "statistics"], self.columns)
             counters.episodes += len(ended)
             learned = time.perf_counter()
-            self._spend("collect", collected - start)
-            self._spend("learn", learned - collected)
+            counters.seconds["collect"] += collected - start
+            counters.seconds["learn"] += learned - collected
+            self._take_time()
             rate = batch.numel() / (learned - start)
             self._log_iteration(log, values, ended, rate)
             interrupt.check()
@@ -236,11 +237,12 @@ class Trainer:
         training, evaluated = ("-" if x is None else f"{x:.2f}" for x in rates)
         return f"{rate:,.0f} steps/s, success {training} (evaluated {evaluated})"
 
-    def _spend(self, what: str, seconds: float) -> None:
-        self.counters.seconds[what] += seconds
-        self.counters.wall_seconds += seconds
-        if what != "collect":  # looking takes milliseconds
-            self.counters.other_seconds += self._others.seconds()
+    def _take_time(self) -> None:
+        """Add what has passed since the last call: all of it, whatever was done meanwhile."""
+        now = time.perf_counter()
+        self.counters.wall_seconds += now - self._looked
+        self.counters.other_seconds += self._others.seconds()
+        self._looked = now
 
     def _training_success(self) -> float | None:
         if len(self._recent) == 0:
@@ -268,8 +270,9 @@ class Trainer:
         if not self.folder.latest.exists():  # where a policy has been evaluated, there is a checkpoint to go on from
             self.save()
         start = time.perf_counter()
-        evaluation = self._evaluators.run(self.learner.policy, config.eval_episodes, PERIODIC_SEED, interrupt.check)
-        self._spend("evaluate", time.perf_counter() - start)
+        evaluation = self._evaluators.run(self.learner.evaluated, config.eval_episodes, PERIODIC_SEED, interrupt.check)
+        self.counters.seconds["evaluate"] += time.perf_counter() - start
+        self._take_time()
         while counters.next_evaluation <= counters.env_steps:
             counters.next_evaluation += config.eval_every
         self._last_evaluation = evaluation
@@ -296,7 +299,7 @@ class Trainer:
 
     def _keep_as_best(self) -> None:
         """Write the networks that act, without critics."""
-        self._checkpoint(pack_modules(self.learner.policy.modules_by_name)).write(self.folder.best)
+        self._checkpoint(pack_modules(self.learner.evaluated.modules_by_name)).write(self.folder.best)
 
     def _final_evaluation(self, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
         """Evaluate the best policy, and zero correction, on seeds that did not select it."""
@@ -307,7 +310,8 @@ class Trainer:
             policy = make_learner(self.config, *self.sizes, self.agents).policy
         unpack_modules(policy.modules_by_name, self._read_best().tensors, self.folder.best)
         evaluation, zero = self._evaluators.final(policy, interrupt.check, zero=self._zero)
-        self._spend("evaluate", time.perf_counter() - start)
+        self.counters.seconds["evaluate"] += time.perf_counter() - start
+        self._take_time()
         return evaluation, zero
 
     def _read_best(self) -> Checkpoint:

@@ -1,9 +1,8 @@
 """The tables in force of an environment: observation, stages, reward terms, limits, numbers; as rows, and as text."""
 
-from collections.abc import Iterator
 from typing import Any
 
-from dora.configs import plain
+from dora.configs import flat, plain
 from dora.tables import text_table
 
 Rows = list[list[str]]
@@ -60,15 +59,14 @@ def limit_rows(env: Any) -> Rows:
 
 def config_rows(env: Any) -> Rows:
     """The numbers in force, under the names with which they can be overridden."""
-    return [["number", "value"], *([name, value] for name, value in _flat(plain(env.config)))]
+    return [["number", "value"], *([name, _text(value)] for name, value in flat(plain(env.config)))]
 
 
-def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", ", ".join(f"{x:g}" for x in value) if isinstance(value, list) else f"{value:g}"
+def _text(value: Any) -> str:
+    """A number, a switch or several numbers, as they are written on the command line."""
+    if isinstance(value, list):
+        return ", ".join(map(_text, value))
+    return str(value) if isinstance(value, bool) else f"{value:g}"
 
 
 TABLES = {

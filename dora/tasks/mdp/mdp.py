@@ -11,7 +11,7 @@ from torch import Tensor
 from dora.tasks.mdp.memory import EpisodeMemory
 from dora.tasks.mdp.observations import Entry
 from dora.tasks.mdp.rewards import Terms
-from dora.tasks.mdp.snapshot import S, Snapshot
+from dora.tasks.mdp.snapshot import ObjectState, S, Snapshot
 from dora.tasks.mdp.stages import Stage
 
 BELOW_TABLE = -0.05
@@ -22,11 +22,13 @@ KNOCKED_AWAY = 0.6
 
 def left_table(s: Snapshot, memory: EpisodeMemory) -> Bool[Tensor, " n"]:
     """An object has left the table or the robot's reach; nothing can mend the episode."""
-    lost = []
-    for o in s.objects.values():
-        away = (o.p[:, :2] - o.start_p[:, :2]).norm(dim=-1)
-        lost.append((o.p[:, 2] < BELOW_TABLE) | (away > KNOCKED_AWAY))
-    return torch.stack(lost).any(0)
+    return torch.stack([gone(o, KNOCKED_AWAY) for o in s.objects.values()]).any(0)
+
+
+def gone(o: ObjectState, reach: float) -> Bool[Tensor, " n"]:
+    """Whether an object has fallen off the table, or is farther from its start than `reach` [m], seen from above."""
+    away = (o.p[:, :2] - o.start_p[:, :2]).norm(dim=-1)
+    return (o.p[:, 2] < BELOW_TABLE) | (away > reach)
 
 
 @dataclass(frozen=True)

@@ -38,8 +38,9 @@ class HandState:
         wrist_p, wrist_q, wrist_v, wrist_w: pose, linear [m/s] and angular velocity [rad/s] of the hand's base.
         tip_p, tip_q: fingertip poses.
         tip_radius: radius of the fingertips [m].
-        touch: contact of each finger, then the palm, with the object during the last physics step.
-        force: magnitude of those contacts' forces [N].
+        touch: contact of each finger, then the palm, with the object during the last physics step, or during all of
+            the control step where the task asks for that (the hammer's).
+        force: magnitude of those contacts' forces, their mean over that time [N].
         contact_p: contact points of the hand on the object in the last physics step, object frame [m].
         contact_finger: what touches there: 0 nothing (an empty row), 1 palm, 2 thumb, ... 6 pinky.
     """

@@ -64,7 +64,8 @@ class MicrowaveTask(Task):
     **Stages**, side by side. Left: reach_handle (thumb and one fingertip within 3 cm of the handle), grasp_handle
     (thumb and one more finger touch it for 0.15 s), open (60 degrees). Right: reach_cube and grasp_cube (the same with
     the cube), carry (8 cm above its start and before the cavity), put_in (the whole cube is behind the front plane),
-    leave (the cube lies inside, nobody touches it, and wrist and fingertips are out, for 0.25 s).
+    leave (the cube rests inside, the right hand does not touch it, both wrists and the right fingertips are out, and
+    the door is open, for 0.25 s).
 
     **Success:** all stages done, and no overlap above 5 mm in the whole episode, of hands, arms, door, body or cube.
 
