@@ -49,10 +49,19 @@ def test_fields_are_overridden_by_name_and_the_others_stay():
     assert overridden(Outer(), Outer(count=5), "config") == Outer(count=5)
 
 
+@pytest.mark.parametrize("env_id", task_ids())
+def test_every_number_of_a_task_says_what_it_means(env_id: str):
+    rows = config_rows(SimpleNamespace(config=task_config(find_task(env_id).CONFIG, "standard", None)))
+    assert [name for name, _, meaning in rows if not meaning] == []
+    meanings = {name: meaning for name, _, meaning in rows}
+    assert meanings["weights.penetration"].startswith("Overlap beyond what is free")
+    assert meanings["control_frequency"] == "Control steps per second [Hz]."
+
+
 def test_numbers_are_shown_as_an_override_takes_them():
     """Switches, too: every value of the table, given back as an option, is the number in force."""
     config = replace(task_config(CubeConfig, "standard", None), optimised=True)
-    shown = dict(config_rows(SimpleNamespace(config=config))[1:])
+    shown = {name: value for name, value, _ in config_rows(SimpleNamespace(config=config))[1:]}
     assert shown["optimised"] == "True"
     assert shown["centre"] == "0.55, 0"
     again = overridden(config, {"optimised": shown["optimised"] == "True"}, "config")

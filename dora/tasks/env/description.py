@@ -1,6 +1,9 @@
 """The tables in force of an environment: observation, stages, reward terms, limits, numbers; as rows, and as text."""
 
+from dataclasses import fields, is_dataclass
 from typing import Any
+
+from docstring_parser import parse_from_object
 
 from dora.configs import flat, plain
 from dora.tables import text_table
@@ -58,8 +61,21 @@ def limit_rows(env: Any) -> Rows:
 
 
 def config_rows(env: Any) -> Rows:
-    """The numbers in force, under the names with which they can be overridden."""
-    return [["number", "value"], *([name, _text(value)] for name, value in flat(plain(env.config)))]
+    """The numbers in force and what they mean, under the names with which they can be overridden."""
+    meanings = dict(flat(_meanings(env.config)))
+    rows = ([name, _text(value), meanings.get(name, "")] for name, value in flat(plain(env.config)))
+    return [["number", "value", "meaning"], *rows]
+
+
+def _meanings(config: Any) -> dict[str, Any]:
+    """What the docstrings of a configuration say of its fields, by name, nested as the fields are."""
+    documented = [cls for cls in reversed(type(config).__mro__) if is_dataclass(cls)]
+    texts = {p.arg_name: p.description or "" for cls in documented for p in parse_from_object(cls).params}
+    return {
+        field.name: _meanings(value) if is_dataclass(value) else " ".join(texts.get(field.name, "").split())
+        for field in fields(config)
+        for value in (getattr(config, field.name),)
+    }
 
 
 def _text(value: Any) -> str:

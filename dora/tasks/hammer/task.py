@@ -153,8 +153,9 @@ class HammerTask(Task):
 
     **Stages:** catch (the handle is in the hand, touched by two fingers, slower than 0.5 m/s in it, for 0.075 s),
     stabilise (moves less than 8 mm and 0.15 rad in the hand within 0.25 s), orient (striking axis within 15 degrees
-    of the nail axis, face within 15 mm of that axis and 5 mm below to 15 cm above the head, for 0.25 s), strike (blows drive the nail 10 mm; its motion
-    within 50 ms after an impact of the striking face on its head above 0.5 m/s counts).
+    of the nail axis, face within 15 mm of that axis and 5 mm below to 15 cm above the head, for 0.25 s), strike
+    (blows drive the nail 10 mm; its motion within 50 ms after an impact of the striking face on its head above 0.5
+    m/s counts).
 
     **Success:** all stages done, and no overlap above 5 mm in the whole episode.
 
