@@ -1,5 +1,6 @@
 """Whole runs on the fake task: learning, resuming, interruptions, workers."""
 
+import contextlib
 import csv
 import dataclasses
 import functools
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import imageio.v2 as imageio
@@ -24,6 +26,7 @@ from dora.agents.checkpoint import read_checkpoint
 from dora.agents.collecting.rollouts import Rollouts
 from dora.agents.collecting.task_env import EpisodeEnds
 from dora.agents.config import PPOConfig, RunConfig, SACConfig
+from dora.agents.evaluation import play
 from dora.agents.evaluation.play import evaluate_checkpoint, record
 from dora.agents.learners.networks import last_layer
 from dora.agents.learners.ppo import PPO
@@ -362,6 +365,25 @@ def test_a_film_is_written(tmp_path: Path):
     path = tmp_path / "video" / "a.mp4"
     record(functools.partial(PointMass, 1), lambda o: torch.zeros(len(o), 2), path, episodes=1)
     assert path.stat().st_size > 500
+
+
+def test_a_film_shows_episodes_that_begin_with_successive_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    class Filmed(PointMass):
+        """Its picture is as bright as the seed of the episode."""
+
+        def reset(self, seed: Any = None, options: Any = None) -> Any:
+            self.seed = seed
+            return super().reset(seed, options)
+
+        def render(self) -> Tensor:
+            return torch.full((1, 16, 16, 3), self.seed, dtype=torch.uint8)
+
+    shown = []
+    writer = SimpleNamespace(append_data=lambda frame: shown.append(int(frame[0, 0, 0])))
+    monkeypatch.setattr(play.imageio, "get_writer", lambda *_, **__: contextlib.nullcontext(writer))
+    record(lambda: Filmed(1), None, tmp_path / "a.mp4", 3, first_seed=7)
+    length = Filmed(1).max_steps + 1
+    assert shown == [7] * length + [8] * length + [9] * length
 
 
 def test_tensorboard_shows_a_film_as_moving_pictures(tmp_path: Path):

@@ -102,6 +102,12 @@ def test_every_entry_is_expected():
     assert list(EXPECTED) == list(ARM_ENTRIES)
 
 
+def test_what_a_robot_measures_or_knows_of_itself_stays_beside_pictures():
+    """The rest, such as the pose of the object, is what a camera is there for."""
+    sensed = "hand_q hand_v hand_lead arm_q tips tip_axes wrist_p wrist_R wrist_v wrist_w touch time phase residual"
+    assert [name for name, entry in ARM_ENTRIES.items() if entry.sensed] == sensed.split()
+
+
 @pytest.mark.parametrize("name", EXPECTED)
 def test_an_entry_holds_what_it_says(name: str):
     s = state()

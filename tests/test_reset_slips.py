@@ -80,3 +80,12 @@ def test_options_that_a_task_may_know_are_let_through_and_the_others_work(env: A
     state, obs = env.get_state_dict(), env.get_obs()
     found = env.reset(options={START: {"env_states": state, "obs": obs}})[0]
     assert torch.equal(torch.as_tensor(found), torch.as_tensor(obs))
+
+
+def test_rows_of_a_state_are_read_as_they_are_written(env: Any):
+    env.reset(seed=1)
+    saved = env.get_state()
+    env.step(torch.ones(env.action_space.shape))
+    assert not torch.equal(env.get_state(), saved)
+    env.set_state(saved)
+    torch.testing.assert_close(env.get_state(), saved, rtol=0, atol=1e-6)
