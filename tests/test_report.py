@@ -55,6 +55,22 @@ def test_seeds_of_a_group_make_one_row(tmp_path: Path):
     assert len(rows) == 5
 
 
+def test_runs_of_earlier_rules_of_a_task_stand_apart(tmp_path: Path):
+    """A result without a definition is of the first one."""
+    for seed, definition in enumerate(({}, {"definition": 1}, {"definition": 2})):
+        write_run(tmp_path / str(seed), seed, 0.2 * seed)
+        path = tmp_path / str(seed) / "result.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"task_config": definition}))
+    for rules, guidance in (({"Toy-v1": 2}, ["affordance", "affordance, earlier rules"]), ({"Toy-v2": 2}, None)):
+        rows = [row.split(" | ")[3:5] for row in tables(find_runs(tmp_path, rules)).splitlines()[2:]]
+        if guidance:
+            assert rows == [[guidance[0], "1"], [guidance[1], "2"]]
+        else:
+            assert not any("earlier" in row[0] for row in rows)
+    write_report(tmp_path, tmp_path / "out", {"Toy-v1": 2})
+    assert "earlier rules': what counts as a success has changed" in (tmp_path / "out" / "tables.md").read_text()
+
+
 def test_runs_of_tasks_with_other_numbers_are_not_averaged(tmp_path: Path):
     """Named by the switch where it tells them apart, else by all that differs."""
     numbers = [

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from dora.agents.reports.paper import BETTER, DIFFERENCES, JUG_GAIN, MEAN_GAIN, ONE_ARM, PAPER, Cell
 from dora.agents.reports.run_results import (
     DEFAULT_PRESET,
+    EARLIER,
     SHARED,
     UNKNOWN,
     Run,
@@ -67,7 +68,7 @@ def sections(runs: Sequence[Run]) -> list[Section]:
 def of_the_paper(runs: Sequence[Run]) -> dict[Cell, list[Run]]:
     """The runs of each cell of the paper's tables: preset `standard`, the task's own reward, trained. Of several
     budgets the largest with which the task was run with guidance, so that all its cells have the same; of several
-    variants of a task's numbers that with most runs, the first of equals."""
+    variants of a task's numbers that with most runs by its present rules, the first of equals."""
     groups = {
         (env, agent, guidance.partition(",")[0], thousands, guidance): members
         for (env, preset, agent, guidance, thousands), members in grouped(runs).items()
@@ -77,9 +78,14 @@ def of_the_paper(runs: Sequence[Run]) -> dict[Cell, list[Run]]:
     found: dict[Cell, list[Run]] = {}
     for (env, agent, guidance, thousands, _), members in groups.items():
         cell = env, agent, guidance
-        if thousands == budget[env] and len(members) > len(found.get(cell, [])):
+        if thousands == budget[env] and _worth(members) > _worth(found.get(cell, [])):
             found[cell] = members
     return found
+
+
+def _worth(runs: Sequence[Run]) -> tuple[int, int]:
+    """Order of variants: runs by the present rules, runs."""
+    return sum(not run.outdated for run in runs), len(runs)
 
 
 def _budget(groups: Sequence[tuple[str, str, str, int, str]]) -> int:
@@ -99,7 +105,7 @@ def variant(runs: Sequence[Run]) -> str:
     switches = [
         in_words(name, str(value)) for name, value in words.items() if isinstance(value, bool) and name in SWITCHES
     ]
-    return ", ".join([steps, *switches])
+    return ", ".join([steps, *switches]) + (EARLIER if runs[0].outdated else "")
 
 
 def success_of(runs: Sequence[Run]) -> Float[np.ndarray, "seeds starts"] | None:
@@ -342,7 +348,12 @@ def _overlap(runs: Sequence[Run]) -> Section:
             cells = [f"{np.percentile(depth, q):.1f}" for q in (50, 90, 95, 99)]
             rows.append([env, preset, agent, guidance, str(len(depth)), *cells, f"{depth.max():.1f}"])
     head = ("task", "preset", "learner", "guidance", "episodes", "median", "90 %", "95 %", "99 %", "largest")
-    return Section("Largest overlap of an episode [mm]", head, rows, "In any physics step, of anything with anything.")
+    return Section(
+        "Largest overlap of an episode [mm]",
+        head,
+        rows,
+        "In any physics step, of anything with anything. Runs without an eval.csv are left out.",
+    )
 
 
 def _failures(runs: Sequence[Run]) -> Section:
@@ -354,7 +365,12 @@ def _failures(runs: Sequence[Run]) -> Section:
             text = ", ".join(f"{kind} {100 * share:.1f}" for kind, share in kinds.items())
             rows.append([env, preset, agent, guidance, text or "none"])
     head = ("task", "preset", "learner", "guidance", "share of episodes %")
-    return Section("Why episodes fail", head, rows, "By the first stage that was not reached, or overlap alone.")
+    return Section(
+        "Why episodes fail",
+        head,
+        rows,
+        "By the first stage that was not reached, or overlap alone. Runs without an eval.csv are left out.",
+    )
 
 
 def failure_kinds(tables: Sequence[Mapping[str, Float[np.ndarray, " _"]]]) -> dict[str, float]:

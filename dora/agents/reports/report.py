@@ -1,7 +1,7 @@
 """Tables and curves from finished runs: everything a README may claim, made from files."""
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import mean, stdev
 from urllib.parse import quote
@@ -11,6 +11,7 @@ from dora.agents.reports.figures import SECONDS_PER_MINUTE, draw_curves, draw_ov
 from dora.agents.reports.run_results import (
     ALONE,
     DEFAULT_PRESET,
+    EARLIER,
     SHARED,
     UNKNOWN,
     Run,
@@ -67,7 +68,8 @@ NOTE = (
     "In brackets Wilson's 95 % interval over the evaluation episodes of all seeds, which does not hold how much seeds "
     "differ. Episodes of zero correction on the same starts are the same and count once. Other columns: mean and "
     f"deviation over seeds. Minutes with{SHARED}: other programs kept more than {ALONE} cores busy meanwhile; "
-    f"with{UNKNOWN}: that was not measured."
+    f"with{UNKNOWN}: that was not measured. Guidance with '{EARLIER.strip(', ')}': what counts as a success has "
+    "changed since (definition in the task's numbers), and the policies were not evaluated by the rules of now."
 )
 """What stands below the table."""
 
@@ -124,15 +126,15 @@ def file_name(name: str) -> str:
     return quoted if len(quoted) <= LONGEST_FILE else f"{quoted[:LONGEST_FILE]}-{digest_of(name)[:8]}"
 
 
-def write_report(root: Path, out: Path) -> list[Path]:
+def write_report(root: Path, out: Path, rules: Mapping[str, int] | None = None) -> list[Path]:
     """Writes `tables.md`, `comparison.md` (sub-tasks, overlap, failures, the paper's tables, starts), curves, overlap
     and success against starts of each task and preset as figures, and `report.html`, which holds all of it, into `out`;
-    returns their paths.
+    returns their paths. `rules` are those of `find_runs`.
 
     Raises:
         InputError: there is no finished run, a file of one is damaged, or `out` cannot be written.
     """
-    runs = find_runs(root)
+    runs = find_runs(root, rules)
     began, figures = starts_section(runs), dict[str, bytes]()
     compared = [*sections(runs), *([began] if began.rows else [])]
     for env, preset in sorted({run.group[:2] for run in runs if run.curve or run.progress}):

@@ -1,7 +1,7 @@
 """Finished runs as they lie in folders, and which of them make one row of a report."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,9 @@ SHARED, UNKNOWN = " \N{DAGGER}", " ?"
 IN_WORDS = {("optimised", "False"): "grasp made by hand", ("optimised", "True"): "grasps of the search"}
 """Values of switches of tasks, by name and value, as readers of a table know them."""
 
+EARLIER = ", earlier rules"
+"""What is added to the guidance of runs whose task has other rules now."""
+
 Group = tuple[str, str, str, str, int]
 """Environment, preset, agent, guidance, steps in thousands (rounded): what the runs of one row of the table share."""
 
@@ -42,6 +45,8 @@ class Run:
     progress: dict[str, Float[np.ndarray, " rows"]] = field(default_factory=dict)
     episodes: dict[str, Float[np.ndarray, " e"]] = field(default_factory=dict)
     zero: dict[str, Float[np.ndarray, " z"]] = field(default_factory=dict)
+    outdated: bool = False
+    """The task's rules have changed since (`TaskConfig.definition`)."""
 
     @property
     def group(self) -> Group:
@@ -54,6 +59,7 @@ class Run:
         agent = result["agent"].upper()
         agent += ", paper's reward" if result.get("reward", "dense") == "paper" else ""
         agent += ", evaluated again" if result.get("checkpoint") else ""
+        guidance += EARLIER if self.outdated else ""
         return result["env"], task.get("preset", DEFAULT_PRESET), agent, guidance, round(self.budget / 1000)
 
     @property
@@ -62,8 +68,12 @@ class Run:
         return self.result.get("total_steps", self.result["env_steps"])
 
 
-def find_runs(root: Path) -> list[Run]:
+def find_runs(root: Path, rules: Mapping[str, int] | None = None) -> list[Run]:
     """All finished runs under `root`, by path; unfinished ones are left out.
+
+    Args:
+        root: folder that is searched.
+        rules: `definition` of the present rules of tasks, by id; runs of earlier ones are `outdated`.
 
     Raises:
         InputError: if there is none, or a result file is damaged.
@@ -78,7 +88,9 @@ def find_runs(root: Path) -> list[Run]:
             shares = {"eval.csv": result["success_rate"], "zero.csv": result["zero_success_rate"]}
             count = result.get("eval_episodes")
             episodes, zero = (_episodes(path.with_name(name), share, count) for name, share in shares.items())
-            runs.append(Run(path.parent, result, rows, trained, episodes, zero))
+            definition = (result.get("task_config") or {}).get("definition", NEUTRAL["definition"])
+            outdated = definition != (rules or {}).get(result["env"], definition)
+            runs.append(Run(path.parent, result, rows, trained, episodes, zero, outdated))
     if not runs:
         raise InputError(f"there is no finished run under {root}: point at a folder with result.json files in it.")
     return _with_zero(_once(runs))
