@@ -14,7 +14,6 @@ from commands import call, load_command
 from dora.agents.config import PPOConfig, RunConfig
 from dora.agents.limits import MOST_TRANSITIONS, check
 from dora.errors import InputError
-from dora.tools.demonstrations import record_demonstrations
 
 RUN = "--env DoraCube-v1 --workers 0"
 RESULTS = Path(__file__).parents[1] / "results" / "tasks" / "DoraCube-v1" / "ppo-affordance-s10"
@@ -230,12 +229,6 @@ def test_other_commands(
 def test_keywords_of_a_task(options: dict, message: str):
     with pytest.raises(InputError, match=message):
         gym.make("DoraCube-v1", **options)
-
-
-@pytest.mark.parametrize("seed", [-1, 2**32])
-def test_demonstrations_need_seeds_that_numpy_takes(tmp_path: Path, seed: int):
-    with pytest.raises(InputError, match="seeds of all have to be from 0"):
-        record_demonstrations("DoraJug-v1", tmp_path, 1, 1, seed)
 
 
 @pytest.mark.parametrize("damaged", [False, True])

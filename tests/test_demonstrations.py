@@ -10,20 +10,21 @@ import pytest
 import torch
 
 import dora.tasks as tasks
-from dora.errors import InputError
-from dora.tools.demonstrations import record_demonstrations
+from dora.datasets.episodes import Plan
+from dora.datasets.record import record_dataset
+from dora.datasets.sources import find_source
 
 
 @pytest.mark.slow
 def test_successes_are_recorded_and_can_be_played_again(tmp_path: Path):
-    made = record_demonstrations("DoraJug-v1", tmp_path, tries=3, num_envs=3, seed=5, preset="none")
-    assert made.tried == 3
-    assert 1 <= made.recorded <= 3
-    index = json.loads(made.path.with_suffix(".json").read_text())
+    path = tmp_path / "new" / "demonstrations.h5"
+    made = record_dataset("maniskill", find_source("DoraJug-v1", "scripted", "none"), Plan(2, 5, True, 3), path.parent)
+    assert (made.episodes, made.successes) == (2, 2)
+    index = json.loads(path.with_suffix(".json").read_text())
     assert index["env_info"]["env_id"] == "dora:DoraJug-v1"
-    assert len(index["episodes"]) == made.recorded
-    with h5py.File(made.path) as file:
-        assert len(file) == made.recorded
+    assert len(index["episodes"]) == 2
+    with h5py.File(path) as file:
+        assert len(file) == 2
         group: Any = file["traj_0"]
         episode = index["episodes"][0]
         actions, success = np.array(group["actions"]), np.array(group["success"])
@@ -38,8 +39,3 @@ def test_successes_are_recorded_and_can_be_played_again(tmp_path: Path):
     assert info["success"].all()
     np.testing.assert_allclose(task.snapshot.object.p[0].numpy(), poses[-1, :3], atol=0.01)
     task.close()
-
-
-def test_no_try_is_refused(tmp_path: Path):
-    with pytest.raises(InputError, match="at least one try"):
-        record_demonstrations("DoraCube-v1", tmp_path, tries=0)

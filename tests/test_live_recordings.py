@@ -10,18 +10,20 @@ import numpy as np
 import pytest
 from live import Watched
 
+from dora.datasets.episodes import Plan
+from dora.datasets.record import record_dataset
+from dora.datasets.sources import find_source
 from dora.errors import InputError
 from dora.live.orders import Choose, Play, Randomise, Start
 from dora.live.players import ZERO, recorded, zero_correction
 from dora.live.recordings import Recording
-from dora.tools.demonstrations import record_demonstrations
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = record_demonstrations("DoraCube-v1", tmp_path_factory.mktemp("recorded"), tries=2, num_envs=2, seed=5)
-    assert made.recorded > 0
-    return made.path
+    folder = tmp_path_factory.mktemp("recorded") / "new"
+    record_dataset("maniskill", find_source("DoraCube-v1", "scripted"), Plan(2, 5, True, 2), folder)
+    return folder / "demonstrations.h5"
 
 
 @pytest.mark.slow

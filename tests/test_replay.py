@@ -15,9 +15,11 @@ import torch
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 import dora.sim
+from dora.datasets.episodes import Plan
+from dora.datasets.record import record_dataset
+from dora.datasets.sources import find_source
 from dora.errors import InputError
 from dora.tasks.mdp.randomisation import PRESETS
-from dora.tools.demonstrations import record_demonstrations
 
 STEPS = 12
 WAYS = {"actions": [], "first state": ["--use-first-env-state"], "states": ["--use-env-states"]}
@@ -58,14 +60,14 @@ def record(folder: Path, env_id: str, num_envs: int, **options: Any) -> Path:
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder, batch = tmp_path_factory.mktemp("recordings"), {"sim_backend": dora.sim.BACKEND}
     dense = {"render_backend": "none"}
-    made = record_demonstrations("DoraCube-v1", folder / "demonstrations", tries=2, num_envs=2, seed=5, preset="none")
-    assert made.recorded > 0
+    source, plan = find_source("DoraCube-v1", "scripted", "none"), Plan(2, 5, True, 2)
+    record_dataset("maniskill", source, plan, folder / "demonstrations")
     return {
         "one": record(folder / "one", "DoraCube-v1", 1),
         "three": record(folder / "three", "DoraCube-v1", 3),
         "three of other sizes": record(folder / "sizes", "DoraJug-v1", 3, preset="hard", **batch),
         "three of ManiSkill's": record(folder / "stock", "PickCube-v1", 3, **batch, **dense),
-        "demonstrations": made.path,
+        "demonstrations": folder / "demonstrations" / "demonstrations.h5",
     }
 
 

@@ -1,1 +1,1 @@
-"""What stands above the tasks: ranking in the task, pages, pictures, demonstrations, benchmarks."""
+"""What stands above the tasks: ranking in the task, pages, pictures, benchmarks."""
