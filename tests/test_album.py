@@ -143,6 +143,14 @@ def test_those_farthest_from_each_other_are_pictured_beside_the_best(candidates:
     assert chosen(replace(line, position=torch.zeros(COUNT, 3))) == [0, 1, 2, 3]
 
 
+def test_a_grasp_that_never_succeeded_is_only_pictured_where_none_did(candidates: GraspCandidates):
+    alone = replace(candidates, valid=torch.ones(COUNT, dtype=torch.bool), grasp_class=("BodyGrasp",) * COUNT)
+    some = replace(alone, score=torch.where(torch.arange(COUNT) % 3 == 0, 0.5, 0.0))
+    assert chosen(some) == [0, 3, 6, 9]
+    for scores in (torch.zeros(COUNT), torch.full((COUNT,), torch.nan)):
+        assert len(chosen(replace(alone, score=scores))) == 4
+
+
 def test_maps_and_titles_are_those_of_the_chosen_grasps(
     candidates: GraspCandidates, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):

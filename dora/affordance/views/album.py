@@ -81,10 +81,13 @@ def _make(folder: Path) -> None:
 
 def chosen(candidates: GraspCandidates) -> list[int]:
     """Rows of at most `SHOWN` valid grasps (of any if none is valid): the first of every class, then one by one
-    the grasp whose wrist is farthest from those that are shown already."""
+    the grasp whose wrist is farthest from those that are shown already, of those that have ever succeeded where some
+    have."""
     valid = candidates.valid.nonzero()[:, 0].tolist() or list(range(len(candidates)))
     names = candidates.grasp_class
     found = [row for i, row in enumerate(valid) if names[row] not in {names[other] for other in valid[:i]}][:SHOWN]
+    proven = [row for row in valid if row in found or candidates.score[row] > 0]
+    valid = proven if (candidates.score > 0).any() else valid
     position, turn = candidates.position[valid], candidates.quaternion[valid]
 
     def away(row: int) -> Tensor:
