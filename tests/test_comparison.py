@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from dora.agents.reports import statistics
-from dora.agents.reports.comparison import Section, failure_kinds, of_the_paper, sections
+from dora.agents.reports.comparison import Section, of_the_paper, sections
+from dora.agents.reports.failures import failure_kinds
 from dora.agents.reports.paper import BETTER, MEAN_GAIN, ONE_ARM, PAPER
 from dora.agents.reports.report import write_report
 from dora.agents.reports.run_results import find_runs
