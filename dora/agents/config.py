@@ -126,9 +126,6 @@ class SACConfig:
     """Correlation of the exploration noise of successive steps, in [0, 1)."""
     hidden: tuple[int, ...] = (256, 256)
     """Widths of the hidden layers of actor and critics."""
-    averaging: float | None = None
-    """Share by which an average of the actor's weights follows them at each of its gradient steps; evaluations and the
-    policy that is kept use the average. None: they use the actor itself."""
 
 
 NEUTRAL = {"definition": 1, "arm_effort": 1.0, "pose_filter": 1.0, "placed_after_overlap": 0.0}
@@ -137,9 +134,7 @@ UNUSED = {"reward": "dense", "after_success": None}
 """The same of settings of the run."""
 CONSTANT_PULL = {"prior_last": None, "prior_steps": 100_000}
 """Settings of a pull that does not change."""
-NEUTRAL_LEARNER = {name: {"prior": 0.0, **CONSTANT_PULL} for name in ("ppo", "mappo", "happo")} | {
-    "sac": {"averaging": None, **CONSTANT_PULL}
-}
+NEUTRAL_LEARNER = {name: {"prior": 0.0, **CONSTANT_PULL} for name in ("ppo", "mappo", "happo")} | {"sac": CONSTANT_PULL}
 """The same of settings of each learner."""
 DIGITS = 12
 """Hexadecimal digits of a digest of settings."""

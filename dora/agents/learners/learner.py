@@ -21,9 +21,7 @@ class Learner(Protocol):
     """What the training loop needs of an algorithm."""
 
     policy: Policy
-    """Acts while transitions are collected."""
-    evaluated: Policy
-    """Is evaluated and kept: `policy`, or an average of it."""
+    """Acts while transitions are collected, and greedily in evaluations."""
     rollout: int
     """Control steps per environment and batch."""
 

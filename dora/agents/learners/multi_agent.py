@@ -56,7 +56,7 @@ class MultiAgentPPO:
         self.normaliser = Normaliser(observation, normaliser_samples)
         self.actor = JointActor(agents, config.hidden, config.log_std)
         self.critic = Critic(observation, config.hidden, nn.ELU, layer_norm=False)
-        self.policy = self.evaluated = Policy(self.normaliser, self.actor, config.noise_correlation)
+        self.policy = Policy(self.normaliser, self.actor, config.noise_correlation)
         self.steps = 0.0
         self.updates = {n: AgentUpdate(n, for_loss(self.actor.of(n), IndependentNormal), config) for n in agents}
         self.critic_adam = torch.optim.Adam(

@@ -43,7 +43,7 @@ class PPO:
         self.normaliser = Normaliser(observation, normaliser_samples)
         self.actor = GaussianActor(observation, action, config.hidden, config.log_std)
         self.critic = Critic(observation, config.hidden, nn.ELU, layer_norm=False)
-        self.policy = self.evaluated = Policy(self.normaliser, self.actor, config.noise_correlation)
+        self.policy = Policy(self.normaliser, self.actor, config.noise_correlation)
         self.learning_rate, self.steps = config.learning_rate, 0.0
         self.loss = ClipPPOLoss(
             for_loss(self.actor, IndependentNormal),

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
@@ -61,8 +60,6 @@ class SAC:
             "alpha_adam": torch.optim.Adam([log_alpha], lr=config.learning_rate_alpha, fused=True),
         }
         self.replay = Replay(config.capacity, config.batch)
-        self.average = _average(self.actor, config.averaging)
-        self.evaluated = self.policy if self.average is None else _policy(self.normaliser, self.average)
         self._latest = LatestOutput()
         self.actor.register_forward_hook(self._latest)
         self.updates, self.due = 0, 0.0
@@ -70,8 +67,7 @@ class SAC:
     @property
     def modules(self) -> dict[str, nn.Module]:
         """What a checkpoint holds, by name."""
-        average = {} if self.average is None else {"average": self.average}
-        return {"normaliser": self.normaliser, "actor": self.actor, "loss": self.loss, **average}
+        return {"normaliser": self.normaliser, "actor": self.actor, "loss": self.loss}
 
     @property
     def prior(self) -> float:
@@ -138,8 +134,6 @@ class SAC:
         mean, std = self._latest.mean, self._latest.std
         total = loss + self.prior * mean.square().sum(-1).mean()
         _descend(self.optimisers["actor_adam"], total, "loss of the actor")
-        if self.average is not None:
-            self.average.update_parameters(self.actor)
         log_prob = metadata["log_prob"]
         alpha_loss = self.loss.alpha_loss(log_prob).mean()
         _descend(self.optimisers["alpha_adam"], alpha_loss, "loss of the temperature")
@@ -176,16 +170,6 @@ def multi_step(batch: TensorDictBase, steps: int, gamma: float) -> TensorDict:
         },
         batch_size=batch.shape,
     )
-
-
-def _average(actor: TanhActor, share: float | None) -> AveragedModel | None:
-    """Moving average of an actor's weights, which begins with its first ones."""
-    return None if share is None else AveragedModel(actor, multi_avg_fn=get_ema_multi_avg_fn(1 - share))
-
-
-def _policy(normaliser: Normaliser, average: AveragedModel) -> Policy:
-    actor: Any = average.module
-    return Policy(normaliser, actor)
 
 
 def _leaves(parameters: Any) -> list[Any]:
