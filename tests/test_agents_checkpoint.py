@@ -69,6 +69,7 @@ def test_damaged_files_are_refused(path: Path, tmp_path: Path):
         ("best", [0.5], "best has to be a success rate and a return"),
         ("best", [1.5, 3.0], "best has to be a success rate and a return"),
         ("seconds", {"collect": 1.0}, "seconds has to be"),
+        ("seconds", {"collect": 1.0, "learn": -1.0, "evaluate": 0.0}, "seconds has to be"),
         ("learner", {"added": "all"}, "learner has to be finite numbers"),
         ("learner", [3], "learner has to be finite numbers"),
         ("epochs", 3, "has no field 'epochs'"),

@@ -42,6 +42,15 @@ class Outer:
     inner: Inner = field(default_factory=Inner)
 
 
+def test_a_field_that_is_missing_is_named():
+    @dataclass
+    class Needy:
+        length: float
+
+    with pytest.raises(InputError, match=r'^the file: missing value for field "length"\.$'):
+        built(Needy, {}, "the file")
+
+
 def test_fields_are_overridden_by_name_and_the_others_stay():
     changed = overridden(Outer(), {"length": 2, "inner": {"weight": 3}, "both": [1, 2], "limit": 0.5}, "config")
     assert changed == Outer(length=2.0, both=(1.0, 2.0), limit=0.5, inner=Inner(3.0))

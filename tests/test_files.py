@@ -104,6 +104,16 @@ def test_what_could_not_be_read_again_is_not_written(path: Path, limit: str, mon
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
+def test_a_file_may_be_as_large_as_can_be_read_and_no_larger(path: Path, monkeypatch: pytest.MonkeyPatch):
+    size = path.stat().st_size
+    monkeypatch.setattr("dora.files.MOST_BYTES", size)
+    write_tensors(path, KIND, TENSORS, NOTE)
+    assert path.stat().st_size == size
+    monkeypatch.setattr("dora.files.MOST_BYTES", size - 1)
+    with pytest.raises(InputError, match=f"would have {size} bytes; at most {size - 1}"):
+        write_tensors(path, KIND, TENSORS, NOTE)
+
+
 def test_a_file_can_be_read_by_others(tmp_path: Path):
     write_csv(tmp_path / "t.csv", ["a", "b"], [[1, 0.12345678], ["x", 2.0]])
     assert (tmp_path / "t.csv").read_text() == "a,b\n1,0.123457\nx,2\n"

@@ -1,6 +1,7 @@
 """Guidance part by part: which candidates are chosen, how actions correct, what noise and pushes do."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -10,13 +11,21 @@ import dora.tasks as tasks
 from dora.affordance.candidates import GraspCandidates
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector
+from dora.tasks import cube, jug
+from dora.tasks.cube import CubeConfig
 from dora.tasks.env.perturbations import Perturbations, uniform
 from dora.tasks.guidance.candidate_choice import CandidateChoice
 from dora.tasks.guidance.grasp_and_lift import DESCEND, GraspReference, GraspSettings
 from dora.tasks.guidance.residual_action import SMOOTHING, ResidualAction, Target
+from dora.tasks.hammer import mdp as hammer
+from dora.tasks.hammer.task import OBSERVATIONS as OF_HAMMER
+from dora.tasks.hammer.task import HammerConfig
+from dora.tasks.jug import JugConfig
 from dora.tasks.mdp.config import ResidualBounds
 from dora.tasks.mdp.guidance_parts import PARTS
 from dora.tasks.mdp.randomisation import PRESETS, Randomisation
+from dora.tasks.microwave import mdp as microwave
+from dora.tasks.microwave.mdp import MicrowaveConfig
 
 CPU = torch.device("cpu")
 IDENTITY = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
@@ -280,3 +289,30 @@ def test_annealed_shares_survive_a_reset():
     with pytest.raises(InputError):
         task.anneal(error=2.0)
     task.close()
+
+
+def test_the_hand_closes_to_the_grasp_and_no_further():
+    """Also in the time for which it is held closed before it is raised."""
+    settings, up = GraspSettings(), torch.tensor([[0.0, 0.0, -1.0]])
+    reference = GraspReference(1, 0.05, CPU, settings)
+    s = invented(1, goal_grasp=torch.ones(1, 20), goal_approach=up)
+    reference.begin(torch.arange(1), s.hand.wrist_p, s.hand.wrist_q)
+    closed = []
+    for _ in range(60):
+        target = reference.target(s)
+        reference.aim(target)
+        s = invented(1, goal_grasp=torch.ones(1, 20), goal_approach=up, wrist_p=target.wrist_p, wrist_q=target.wrist_q)
+        reference.advance(s)
+        closed.append(float(target.hand.max()))
+    assert closed[0] == 0
+    assert max(closed) == 1
+
+
+@pytest.mark.parametrize("mdp", [cube, jug, hammer, microwave])
+def test_what_knows_regions_exists_with_guidance_only(mdp: Any):
+    """So that guidance without its reward, or without its observations, leaves it out as well."""
+    config = {cube: CubeConfig, jug: JugConfig, hammer: HammerConfig, microwave: MicrowaveConfig}[mdp]()
+    observations = OF_HAMMER if mdp is hammer else mdp.OBSERVATIONS
+    every = [*mdp.terms(config).terms.values(), *mdp.paper_terms(config).terms.values(), *observations.values()]
+    assert sum(one.region for one in every) >= 2
+    assert all(one.guided for one in every if one.region)

@@ -9,6 +9,7 @@ import signal
 import time
 from multiprocessing import parent_process
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import pytest
@@ -311,3 +312,16 @@ def test_what_is_half_learned_is_not_saved(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(trainer.learner, "update", half)
     assert not trainer.run()["finished"]
     assert read_checkpoint(folder.latest).progress["env_steps"] == 0
+
+
+def test_what_a_collector_had_made_before_it_failed_is_let_go_of(monkeypatch: pytest.MonkeyPatch):
+    ended = []
+
+    def failing(self: Any) -> None:
+        self._weight_sync_schemes = {"policy": SimpleNamespace(shutdown=lambda: ended.append("policy"))}
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr(rollouts.MultiSyncCollector, "__init__", failing)
+    with pytest.raises(RuntimeError, match="no memory"):
+        rollouts._Workers()
+    assert ended == ["policy"]

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from test_report import write_run
 
 import dora  # noqa: F401  (registers the tasks)
+from dora.affordance.reach.feasibility_table import Grid
 from dora.agents.collecting.task_env import TaskEnv
 from dora.agents.evaluation.evaluate import Evaluation, run_batch
 from dora.agents.reports import report
@@ -21,6 +22,7 @@ from dora.agents.reports.report import write_report
 from dora.agents.reports.run_results import find_runs
 from dora.agents.reports.starts import bins, starts_section
 from dora.errors import InputError
+from dora.tasks.env.starts import TRIES, standing
 
 
 @pytest.fixture(scope="module", params=["DoraJug-v1", "DoraMicrowave-v1"])
@@ -186,3 +188,15 @@ def test_a_report_that_cannot_be_drawn_replaces_nothing(tmp_path: Path, monkeypa
         write_report(tmp_path / "runs", tmp_path / "out")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["tables.md"]
     assert (tmp_path / "out" / "tables.md").read_text() == "those of before"
+
+
+def test_the_first_place_that_leaves_a_candidate_is_taken_and_the_very_first_where_none_does():
+    """Reached is what lies beyond x = 0.1; of the third row nothing does."""
+    wanted = [0, 2, 0]
+    u = torch.full((3, TRIES, 3), 0.25)
+    u[0, 0, 0], u[0, 2, 0], u[1, 2:, 0] = 0.9, 0.8, torch.linspace(0.95, 0.75, TRIES - 2)
+    heights = torch.tensor([0.1, 0.2, 0.3])
+    p, q = standing(u.flatten(1), heights, Grid((0.0, 0.0), (1.0, 1.0)), lambda p, q: p[:, :1] > 0.1)
+    x = 2 * u[torch.arange(3), torch.tensor(wanted), 0] - 1
+    torch.testing.assert_close(p, torch.stack([x, torch.full((3,), -0.5), heights], -1))
+    assert q.shape == (3, 4)

@@ -41,11 +41,18 @@ ROOMS = {
     "agents.learners": ("dora/agents/learners/*.py",),
     "agents.evaluation": ("dora/agents/evaluation/*.py",),
     "agents.runs": ("dora/agents/runs/*.py",),
+    "agents.reports": ("dora/agents/reports/*.py",),
     "affordance.maps": ("dora/affordance/maps/*.py",),
+    "live": ("dora/live/*.py",),
+    "datasets": ("dora/datasets/*.py",),
+    "sweeps": ("dora/sweeps/*.py",),
+    "policies": ("dora/policies/*.py",),
+    "commands": ("dora/commands/*.py",),
     "files, configs, digests": ("dora/files.py", "dora/configs.py", "dora/digests.py"),
 }
-"""Files of the rooms whose faults are drawn, each room as often as any other."""
-PICTURES = ("figures.py",)
+"""Files of the rooms whose faults are drawn, each room as often as any other. The others (batched physics, grasp search,
+robots, tools) have tests that compare numbers with another implementation, and take longest."""
+PICTURES = ("figures.py", "films.py")
 """Modules that only draw pictures: their faults are seen, not tested."""
 ENOUGH = 0.9
 """Share of the mutants that the tests have to catch."""
