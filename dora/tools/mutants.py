@@ -50,8 +50,8 @@ ROOMS = {
     "commands": ("dora/commands/*.py",),
     "files, configs, digests": ("dora/files.py", "dora/configs.py", "dora/digests.py"),
 }
-"""Files of the rooms whose faults are drawn, each room as often as any other. The others (batched physics, grasp search,
-robots, tools) have tests that compare numbers with another implementation, and take longest."""
+"""Files of the rooms whose faults are drawn, each room as often as any other. The rest (batched physics, grasp search,
+robots, tools) is not drawn from: its tests compare numbers with another implementation, and take longest."""
 PICTURES = ("figures.py", "films.py")
 """Modules that only draw pictures: their faults are seen, not tested."""
 ENOUGH = 0.9
