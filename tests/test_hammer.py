@@ -20,7 +20,7 @@ from dora.tasks.hammer import mdp
 from dora.tasks.hammer.ballistics import Strike, after_fall, arrival, fall_time, slid
 from dora.tasks.hammer.reference import ALIGN, REST, SWING, CatchReference, CatchSettings, Timing, phases
 from dora.tasks.hammer.snapshot import HAND_CENTRE, HammerSnapshot, face_to_nail, handle_distance, misalignment
-from dora.tasks.hammer.task import UNKNOWN, HammerConfig
+from dora.tasks.hammer.task import UNKNOWN, HammerConfig, HammerTask
 
 FACE = (0.04, 0.0, 0.04)
 CONFIG = HammerConfig()
@@ -258,3 +258,17 @@ def test_the_script_catches_strikes_and_stays_clean():
     print(rates, f"success {info['success'].float().mean():.2f}, deepest {info['penetration_max_mm'].max():.1f} mm")
     assert info["success"].float().mean() >= 0.8
     task.close()
+
+
+def test_numbers_of_a_start_that_can_be_chosen_span_what_is_drawn():
+    """Their shares are the random numbers themselves, 0 at the lowest value and 1 at the highest."""
+    c = HammerConfig()
+    starts = HammerTask(c).starts()
+    assert starts is not None
+    ranges = {number.name: (number.low, number.high) for number in starts.numbers}
+    (x, y, _), w = c.release, c.spread
+    assert ranges == {
+        "release x": (x - w, x + w), "release y": (y - w, y + w), "fall": c.fall, "tilt x": (-c.tilt, c.tilt),
+        "tilt y": (-c.tilt, c.tilt), "roll": (-c.roll, c.roll),
+        **{f"spin {axis}": (-c.spin, c.spin) for axis in "xyz"},
+    }  # fmt: skip

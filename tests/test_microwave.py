@@ -22,7 +22,7 @@ from dora.geometry.rotations import (
 from dora.robot import load_robot
 from dora.tasks.microwave import mdp
 from dora.tasks.microwave.mdp import MicrowaveConfig
-from dora.tasks.microwave.reference import entry_turn, with_door
+from dora.tasks.microwave.reference import OpenSettings, PlaceSettings, entry_turn, opening, placing, with_door
 from dora.tasks.microwave.snapshot import CAVITY, LEFT, RIGHT, MicrowaveSnapshot, cube_in_oven, hands_out, inside
 from dora.tasks.microwave.task import MicrowaveTask, mirrored, oven_mount
 
@@ -228,3 +228,9 @@ def test_the_scripted_solution_succeeds_in_85_of_100_starts_without_randomisatio
     assert rates["success"] >= 0.85
     assert made.task.oven.angle.max() < pi / 2
     made.close()
+
+
+def test_where_the_hand_was_is_kept_when_it_begins_to_close():
+    """The wrist stays there while the fingers close, and is led from there."""
+    for waypoints in (opening(OpenSettings(), torch.zeros(3)), placing(PlaceSettings(), 0.0)):
+        assert [w.name for w in waypoints if w.keep] == ["close"]

@@ -166,11 +166,13 @@ def test_the_cube_is_observed_by_its_size_and_the_distance_of_its_surface():
     torch.testing.assert_close(CUBE["surface"].value(s), torch.tensor([[0.1, 0.01, -0.03, 0.0, 0.05]]) - TIP_RADIUS)
 
 
-def test_the_jug_is_observed_by_its_size_and_the_distances_of_its_regions():
-    """A larger jug and a hand with fingertips around it."""
+@pytest.mark.parametrize("seed", range(4))
+def test_the_jug_is_observed_by_its_size_and_the_distances_of_its_regions(seed: int):
+    """A larger jug and a hand with fingertips around its handle."""
+    torch.manual_seed(seed)
     jug, scale = load_object("jug"), 1.2
     centre = scale * torch.as_tensor(jug.centroid(jug.target), dtype=torch.float32)
-    tips = 0.2 * turns(1, FINGERS)[..., :3] + torch.tensor([0.0, 0.0, 0.3])
+    tips = 0.15 * turns(1, FINGERS)[..., :3] + centre
     half = scale * torch.as_tensor(jug.mesh.extents / 2, dtype=torch.float32)[None]
     s = invented(1, tip_p=tips, object_half=half)
     torch.testing.assert_close(JUG["scale"].value(s), torch.tensor([[scale]]))

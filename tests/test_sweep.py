@@ -19,10 +19,10 @@ from dora.affordance.bundled_sets import bundled_path
 from dora.commands import run
 from dora.commands import sweep as command
 from dora.errors import InputError
-from dora.sweeps.board import Board, duration, summary
+from dora.sweeps.board import Board, _news, duration, summary
 from dora.sweeps.launching import LOG, LocalLauncher, is_locked, resuming, steps_of
 from dora.sweeps.plan import MECHANISM, Row, rows_of
-from dora.sweeps.sweep import State, Sweep
+from dora.sweeps.sweep import Entry, State, Sweep
 from dora.tasks import find_task
 
 
@@ -189,6 +189,28 @@ def test_every_run_is_trained_once(tmp_path: Path, jobs: int):
     again = Sweep(few(), tmp_path)
     again.run(fake("fails"), nothing, nothing)  # nothing is left to begin
     assert starts(again) == [1, 1, 1]
+
+
+def test_what_becomes_of_a_run_is_said_in_a_line(tmp_path: Path):
+    (row,) = few(1)
+    entry = Entry(row, tmp_path / "run")
+    said = []
+    for state, others in (
+        (State.WAITING, {}), (State.RUNNING, {}), (State.WAITING, {"complaint": "status 1: no"}),
+        (State.FAILED, {}), (State.DONE, {"success_rate": 0.5}), (State.ELSEWHERE, {"complaint": ""}),
+    ):  # fmt: skip
+        entry.state = state
+        vars(entry).update(others)
+        said.append(_news(entry))
+    assert said == [
+        "waiting", "begins", "will be tried again (status 1: no)",
+        f"failed (status 1: no); what it printed is in {tmp_path / 'run'}/output.log", "done, success 0.500",
+        "running (another process)",
+    ]  # fmt: skip
+    entry.state = State.RUNNING
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "progress.csv").write_text("env_steps,seconds\n7,1\n")
+    assert _news(entry) == "goes on"
 
 
 def test_a_run_that_fails_is_gone_on_with_and_the_others_are_not_held_up(tmp_path: Path):
