@@ -52,10 +52,16 @@ def script() -> ModuleType:
         ("--env DoraCube-v1 --total-steps -5", "--total-steps is -5"),
         ("--env DoraCube-v1 --workers -1", "--workers is -1"),
         ("--env DoraCube-v1 --learner.noise-correlation 1", "--learner.noise-correlation is 1.0"),
-        ("--env DoraCube-v1 --agent trpo", "use --agent with one of ppo, sac, mappo, happo"),
+        ("--env DoraCube-v1 --agent trpo", "use --agent with one of sac, ppo, mappo, happo"),
         ("--resume /nowhere", "not a run folder"),
-        ("--env DoraCube-v1 --learner.learning-rate-min 0.1 --learner.learning-rate-max 0.01", "has to be the smaller"),
-        ("--env DoraCube-v1 --learner.log-std -4", "--learner.log-std-min is -3.0 and --learner.log-std -4.0"),
+        (
+            "--env DoraCube-v1 --agent ppo --learner.learning-rate-min 0.1 --learner.learning-rate-max 0.01",
+            "has to be the smaller",
+        ),
+        (
+            "--env DoraCube-v1 --agent ppo --learner.log-std -4",
+            "--learner.log-std-min is -3.0 and --learner.log-std -4.0",
+        ),
         ("--env DoraCube-v1 --agent sac --learner.capacity 5", "--learner.capacity is 5"),
         ("--eval-only", "--checkpoint"),
         ("--eval-only --zero-correction", "--env"),
@@ -98,7 +104,7 @@ def test_resume_refuses_another_task(
 
 def test_a_bare_command_takes_the_learner_recommended_for_the_task():
     chosen = {env: run.parse(["--env", env]).run for env in ("DoraCube-v1", "DoraJug-v1", "DoraHammer-v1")}
-    assert [config.agent for config in chosen.values()] == ["ppo", "sac", "sac"]
+    assert [config.agent for config in chosen.values()] == ["sac", "sac", "sac"]
     for env, config in chosen.items():
         assert isinstance(config.learner, LEARNER_CONFIGS[config.agent])
         assert config.total_steps == find_task(env).LEARNERS[config.agent]["total_steps"]
@@ -329,8 +335,8 @@ def test_zero_correction_of_a_task_is_evaluated_without_any_policy(
 
 def test_the_reward_of_the_paper_trains(script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     words = (
-        "--env DoraCube-v1 --reward paper --total-steps 128 --num-envs 8 --workers 0 --episodes 2 --eval-envs 2 "
-        "--no-zero-correction --learner.rollout 16 --learner.minibatch 64"
+        "--env DoraCube-v1 --agent ppo --reward paper --total-steps 128 --num-envs 8 --workers 0 --episodes 2 "
+        "--eval-envs 2 --no-zero-correction --learner.rollout 16 --learner.minibatch 64"
     )
     assert call(script, monkeypatch, *words.split(), "--out", str(tmp_path / "run")) == 0
     config = RunFolder(tmp_path / "run").read_config()
@@ -352,7 +358,7 @@ def test_settings_without_a_reward_mean_the_dense_one_and_keep_their_digest():
     there = {name: value for name, value in NEUTRAL.items() if name in content["task"]}
     assert {name: content["task"].pop(name) for name in there} == there
     assert len(there) > 1
-    neutral = NEUTRAL_LEARNER["ppo"]
+    neutral = NEUTRAL_LEARNER["sac"]
     assert {name: content["learner"].pop(name) for name in neutral} == neutral
     assert config.digest() == digest_of(content)[:12] == stored_digests(content)[0]
     assert whole in stored_digests(plain(config))

@@ -15,7 +15,7 @@ from dora.agents.config import PPOConfig, RunConfig
 from dora.agents.limits import MOST_TRANSITIONS, check
 from dora.errors import InputError
 
-RUN = "--env DoraCube-v1 --workers 0"
+RUN = "--env DoraCube-v1 --agent ppo --workers 0"
 RESULTS = Path(__file__).parents[1] / "results" / "tasks" / "DoraCube-v1" / "ppo-affordance-s10"
 JUG = Path(__file__).parents[1] / "objects" / "jug" / "grasps.safetensors"
 EVALUATION = f"--eval-only --checkpoint {RESULTS}/policy.safetensors"

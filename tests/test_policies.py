@@ -217,7 +217,7 @@ def test_the_best_evaluation_during_training_is_chosen_and_not_the_best_result(t
     best = [
         read_checkpoint(run.folder / "policy.safetensors").progress["best"]
         for run in runs
-        if "DoraCube-v1/ppo-affordance-s" in str(run.folder)
+        if run.folder.parent.name == "DoraCube-v1" and "-affordance-s" in run.folder.name
     ]
     assert choice.checkpoint.progress["best"] == max(best)
     assert choice.among == len(best)

@@ -130,7 +130,7 @@ def test_zero_correction_is_evaluated_once_for_all_seeds_and_learners(tmp_path: 
     sweep.run(Noting(lambda folder, zero: fake_words(folder, "well")), nothing, nothing)
     assert set(states(sweep)) == {State.DONE}
     guided = [row for row in rows if row.config.has_prior]
-    assert [row.name.name for row in guided if asked[row.name]] == ["ppo-affordance-s10", "ppo-grasps-s10"]
+    assert [row.name.name for row in guided if asked[row.name]] == ["ppo-affordance-s10", "sac-grasps-s10"]
     assert len(guided) == 6
     assert resuming(tmp_path, zero=False) == [*resuming(tmp_path), "--no-zero-correction"]
 
@@ -287,7 +287,7 @@ def test_the_dry_run_shows_every_run_and_trains_nothing(
     monkeypatch.chdir(tmp_path)
     assert call(command, monkeypatch, "--dry-run", "--env", "DoraCube-v1", "--seeds", "3", "4") == 0
     out = capsys.readouterr().out
-    assert "DoraCube-v1/ppo-affordance-observation-reward-filter-s4" in out
+    assert "DoraCube-v1/sac-affordance-observation-reward-filter-s4" in out
     assert "0 of 12 runs done, 0 running, 12 waiting; about" in out
     assert not list(tmp_path.iterdir())
 

@@ -124,13 +124,13 @@ class CubeTask(Task):
         "front_camera": CameraSpec(eye=(0.95, -0.6, 0.28), target=(0.53, 0.0, 0.18), fov=0.8),
     }
     LEARNERS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "sac": {
+            "total_steps": 300_000, "stop_success": 0.99, "num_envs": 32, "eval_every": 50_000, "eval_episodes": 50,
+            "eval_envs": 50,
+        },
         "ppo": {
             "total_steps": 300_000, "stop_success": 0.99, "num_envs": 64, "eval_every": 40_000, "eval_episodes": 50,
             "eval_envs": 50, "learner": {"rollout": 16, "log_std": -1.0},
-        },
-        "sac": {
-            "total_steps": 200_000, "stop_success": 0.99, "num_envs": 32, "eval_every": 50_000, "eval_episodes": 50,
-            "eval_envs": 50,
         },
     }  # fmt: skip
 
