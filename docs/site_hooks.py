@@ -38,7 +38,7 @@ def in_mathml(page: str) -> str:
 
 
 def at_a_glance(table: str) -> str:
-    """Those columns of the first table of a Markdown page that are shown at a glance, of runs with the task's reward."""
+    """Those columns of the first table of a Markdown page that are shown at a glance, of runs with the usual reward."""
     rows = [[cell.strip() for cell in line.strip("| ").split("|")] for line in table.splitlines() if line[:1] == "|"]
     places = [rows[0].index(name) for name in COLUMNS]
     kept = [row for row in rows[1:] if OTHER_REWARD not in row[places[2]]]

@@ -223,7 +223,8 @@ def test_a_task_on_a_gpu_says_that_overlap_is_not_known(
 ):
     monkeypatch.setattr(options.logger, "propagate", True)
     given: Any = ("none", None, 20, task_config(CubeConfig, "none", None), None, CubeTask.robots(), 2, None)
-    chosen = options.check_options(*given, backend, "none", None, "state")
+    check: Any = options.check_options
+    chosen = check(*given, backend, "none", None, "state")
     assert chosen.sim_backend == backend
     assert "does not report on a GPU how deep bodies overlap" in caplog.text
 
@@ -231,5 +232,6 @@ def test_a_task_on_a_gpu_says_that_overlap_is_not_known(
 def test_the_default_is_a_cpu_with_and_without_cuda(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     given: Any = ("none", None, 20, task_config(CubeConfig, "none", None), None, CubeTask.robots())
+    check: Any = options.check_options
     for count, backend in ((1, "physx_cpu"), (2, "physx_cpu_batch")):
-        assert options.check_options(*given, count, None, "auto", "none", None, "state").sim_backend == backend
+        assert check(*given, count, None, "auto", "none", None, "state").sim_backend == backend
