@@ -2,10 +2,9 @@
 
 import itertools
 import math
-import re
 import time
 from collections.abc import Iterator
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import FrozenInstanceError
 from typing import Any
 
 import numpy as np
@@ -13,17 +12,11 @@ import pytest
 import torch
 from live import Watched
 
-from dora.agents.runs.recommended import recommended
-from dora.commands import play
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_apply
 from dora.live.orders import Choose, Play, Push, Randomise, Repeat, Reset, Run, Speed, Start, Step
 from dora.live.players import ZERO, Player, zero_correction
-from dora.live.reading import verdict
 from dora.live.session import Session
-from dora.live.status import ACTIVE, GOOD, QUIET, status
-from dora.policies.policy import TaskPolicy
-from dora.tasks import find_task
 
 BUSY = "busy"
 """A player that moves the fingers."""
@@ -250,14 +243,6 @@ def test_a_preset_is_in_force_from_the_next_episode_on(cube: Watched):
     assert "unknown preset 'harder': did you mean 'hard'?" in cube.do(Randomise("harder")).message
 
 
-def test_a_policy_keeps_its_numbers_of_the_task_under_another_preset():
-    player = Player("policy", {"preset": "standard", "config": {"lift": 0.12, "randomisation": {"size": 0.5}}}, busy)
-    options = player.options_with("DoraCube-v1", "none")
-    assert options["preset"] == "none"
-    assert options["config"]["lift"] == 0.12
-    assert options["config"]["randomisation"]["size"] == 0.0
-
-
 def test_forces_are_those_that_the_task_reads(hammer: Watched):
     state = hammer.steps(45)
     assert state.episode.stages[0] >= 2
@@ -297,47 +282,6 @@ def test_a_state_is_frozen_and_its_history_does_not_grow(cube: Watched):
     cube.steps(3)
     assert len(state.episode.history.time) == 2
     assert len(cube.state.episode.history.time) == 5
-
-
-def info(**given: float | bool) -> dict[str, torch.Tensor]:
-    base = {"success": False, "raw_success": False, "fail": False, "unreachable": False, "penetration_max_mm": 1.0}
-    return {name: torch.tensor([value]) for name, value in {**base, **given}.items()}
-
-
-@pytest.mark.parametrize(
-    ("given", "over", "words"),
-    [
-        ({}, False, "under way"),
-        ({}, True, "failed: the time was over in the stage 'stabilise'"),
-        ({"fail": True}, True, "failed: it burst"),
-        ({"fail": True, "unreachable": True}, True, "failed: no candidate can be reached from this start"),
-        ({"success": True}, True, "success: all stages done, largest overlap 1.0 mm"),
-        (
-            {"raw_success": True, "penetration_max_mm": 7.25},
-            True,
-            "failed: an overlap of 7.2 mm, above the limit of 5 mm",
-        ),
-        ({"penetration_max_mm": 7.25}, False, "cannot succeed any more: an overlap of 7.2 mm, above the limit of 5 mm"),
-    ],
-)
-def test_the_verdict_names_the_cause(hammer: Watched, given: dict[str, Any], over: bool, words: str):
-    assert verdict(hammer.state.setup, (1,), "it burst", info(**given), over) == words
-
-
-@pytest.mark.parametrize(
-    ("stages", "words"),
-    [((0, 2), "'open'"), ((2, 1), "'put_in'"), ((1, 0), "'leave' and 'carry'"), ((2, 2), "'leave' and 'put_in'")],
-)
-def test_each_arm_has_a_ladder_of_its_own(cube: Watched, stages: tuple[int, int], words: str):
-    """An arm that is ahead says nothing about the other; last, both were done, but not at the same time."""
-    ladders = ("open", "leave"), ("carry", "put_in")
-    setup = replace(cube.state.setup, ladders=ladders)
-    assert verdict(setup, stages, "", info(), True) == f"failed: the time was over in the stage {words}"
-    shown = status(replace(cube.state, setup=setup, episode=replace(cube.state.episode, stages=stages)))
-    for ladder, active in zip(ladders, stages, strict=True):
-        for k, name in enumerate(ladder):
-            (box,) = re.findall(rf"background: (#\w+);[^>]*>{name}</span>", shown)
-            assert box == (GOOD if k < active else ACTIVE if k == active else QUIET), name
 
 
 def wait_for(found: Any, patience: float = 60.0) -> None:
@@ -403,24 +347,3 @@ def test_nobody_who_acts_and_unknown_names_are_refused():
         Session("DoraCube-v1", [zero_correction({})], preset="standart")
     with pytest.raises(InputError, match="did you mean 'DoraCube-v1'"):
         Session("DoraCub-v1", [zero_correction({})])
-
-
-@pytest.mark.parametrize(
-    ("guidance", "parts", "offered"),
-    [
-        ("affordance", None, True), ("grasps", None, True), ("none", None, False),
-        ("affordance", ("observation", "reward"), False),
-    ],
-)  # fmt: skip
-def test_zero_correction_is_offered_where_there_is_a_reference_to_correct(
-    guidance: Any, parts: Any, offered: bool, monkeypatch: pytest.MonkeyPatch
-):
-    config = recommended("DoraCube-v1", "ppo", find_task("DoraCube-v1").LEARNERS, guidance=guidance)
-    config = replace(config, guidance_parts=parts)
-    policy = object.__new__(TaskPolicy)
-    policy.config = config
-    monkeypatch.setattr(play, "load_policy", lambda _: policy)
-    assert [player.name for player in play.find_players(play.Args("DoraCube-v1"))] == ["policy", ZERO][: 1 + offered]
-    if not offered:
-        with pytest.raises(InputError, match="without any"):
-            play.find_players(play.Args("DoraCube-v1", zero_correction=True))
