@@ -1,6 +1,7 @@
 """Every file in `examples/` runs; ManiSkill's `demo_robot` shows the robot, and `demo_random_action` moves it."""
 
 import os
+import re
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -17,7 +18,7 @@ EXAMPLES = {
     "maniskill_tools": (["--out", "recorded"], "Replayed 1 episodes, 1/1=100.00% demos saved"),
     "own_energy": ([], "with weight 200 the energy is 0."),
     "pettingzoo_arms": (["--episodes", "1"], "agents: left, right; state of"),
-    "read_dataset": (["--out", "cube"], "2 episodes, 110 frames at 20 Hz"),
+    "read_dataset": (["--out", "cube"], " frames at 20 Hz: observation.state, action"),
     "skrl_ppo": (["--steps", "256", "--num-envs", "4", "--episodes", "4"], "after 256 steps: return"),
     "stable_baselines": (["--steps", "256", "--num-envs", "4", "--episodes", "4"], "of 4 episodes"),
     "third_party_task": ([], "4 of 4 palms came to their cubes"),
@@ -97,6 +98,14 @@ def test_an_example_runs(name, tmp_path):
     result = run(str(DEMO.parent / f"{name}.py"), *arguments, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert printed in result.stdout
+
+
+@pytest.mark.slow
+def test_a_dataset_that_is_read_back_holds_the_frames_of_its_episodes(tmp_path):
+    result = run(str(DEMO.parent / "read_dataset.py"), "--out", "cube", cwd=tmp_path)
+    (counts,) = re.findall(r"(\d+) episodes, (\d+) frames at 20 Hz", result.stdout)
+    steps = [int(count) for count in re.findall(r"seed \d+: (\d+) steps", result.stdout)]
+    assert (len(steps), sum(steps)) == tuple(map(int, counts)) and min(steps) > 20
 
 
 @pytest.mark.slow
