@@ -38,15 +38,16 @@ def load_policy(which: "str | _Path") -> "TaskPolicy":
 
 
 def _is_command() -> bool:
-    """Whether Python starts `dora` or `python -m dora`, which registers everything when it knows what to do.
+    """Whether Python starts `dora`, `python -m dora` or a file of `experiments/`, which register when they know what to do.
 
-    A process that such a command starts has its `argv`, but not its command line, and registers everything.
+    Those files say that they are `dora` (`sys.argv[0]`). A process that such a command starts has its `argv`, but not its command line, and registers everything.
     """
     program, arguments = _sys.argv[0], _sys.argv[1:]
     asked = _sys.orig_argv[: len(_sys.orig_argv) - len(arguments)]
     if program == "-m":
         return asked[-1] in ("dora", "-mdora")
-    return program in _sys.orig_argv and _Path(program).name in ("dora", "dora.exe")
+    started = program in _sys.orig_argv or asked[-1].endswith(".py")
+    return started and _Path(program).name in ("dora", "dora.exe")
 
 
 if not _is_command():

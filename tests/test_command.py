@@ -151,6 +151,18 @@ def test_the_import_registers_everything_in_a_process_that_a_command_starts(tmp_
     assert result.returncode == 0, result.stderr
 
 
+SCRIPTS = sorted((Path(command.__file__).parents[1] / "experiments").glob("*.py"))
+"""Files of `experiments/`, each of which is a command."""
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=[path.stem for path in SCRIPTS])
+def test_a_script_answers_signals_before_it_imports_what_does_the_work(script: Path):
+    """So that Ctrl-C during the imports shows a line and no traceback, as with `dora`."""
+    shown = run(sys.executable, "-X", "importtime", str(script), "--help").stderr
+    imported = [line.rpartition("|")[2].strip() for line in shown.splitlines()]
+    assert imported.index("dora.quiet_start") < imported.index("torch")
+
+
 @pytest.mark.parametrize("shell", command.SHELLS)
 def test_completion_knows_commands_and_options(capsys: pytest.CaptureFixture[str], shell: str):
     assert command.main(["--completion", shell]) == 0
