@@ -38,15 +38,17 @@ def load_policy(which: "str | _Path") -> "TaskPolicy":
 
 
 def _is_command() -> bool:
-    """Whether Python starts `dora`, `python -m dora` or a file of `experiments/`, which register when they know what to do.
+    """Whether Python starts `dora`, `python -m dora` or a file of `experiments/`: these register when they need it.
 
-    Those files say that they are `dora` (`sys.argv[0]`). A process that such a command starts has its `argv`, but not its command line, and registers everything.
+    Those files say that they are `dora` (`sys.argv[0]`). A process that such a command starts has its `argv`, but not
+    its command line, and registers everything.
     """
     program, arguments = _sys.argv[0], _sys.argv[1:]
-    asked = _sys.orig_argv[: len(_sys.orig_argv) - len(arguments)]
+    asked = _sys.orig_argv[: max(len(_sys.orig_argv) - len(arguments), 0)]
+    last = asked[-1] if asked else ""
     if program == "-m":
-        return asked[-1] in ("dora", "-mdora")
-    started = program in _sys.orig_argv or asked[-1].endswith(".py")
+        return last in ("dora", "-mdora")
+    started = program in _sys.orig_argv or last.endswith(".py")
     return started and _Path(program).name in ("dora", "dora.exe")
 
 

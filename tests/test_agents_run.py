@@ -148,6 +148,27 @@ def test_an_evaluation_under_another_preset_has_all_numbers_of_it():
         assert config.task["pose_filter"] == wanted.pose_filter
 
 
+def test_a_policy_is_evaluated_by_the_rules_of_now(tmp_path: Path):
+    """Whatever rules it was trained by; its digest says that these are others."""
+    path = next(path for path in COMMITTED if path.parents[1].name == "DoraHammer-v1")
+    checkpoint = read_checkpoint(path)
+    earlier = dataclasses.replace(checkpoint.config, task=checkpoint.config.task | {"definition": 1})
+    old = dataclasses.replace(checkpoint, config=earlier, config_digest=earlier.digest())
+    old.write(tmp_path / "old.safetensors")
+    assert run.parse(f"--eval-only --checkpoint {tmp_path / 'old.safetensors'}".split()).run.task["definition"] == 2
+
+
+def test_settings_of_earlier_versions_can_be_read_and_are_refused_for_new_runs(tmp_path: Path):
+    stored = recommended("DoraCube-v1", "ppo")
+    wide = dataclasses.replace(stored, final_episodes=20_000, learner=dataclasses.replace(stored.learner, log_std=0.3))
+    RunFolder(tmp_path).create(wide)
+    assert RunFolder(tmp_path).read_config() == wide
+    assert run.parse(["--resume", str(tmp_path)]).run.final_episodes == 20_000
+    for option, value in (("--episodes", "20000"), ("--eval-episodes", "20000"), ("--learner.log-std", "0.3")):
+        with pytest.raises(InputError, match=option):
+            run.parse(["--env", "DoraCube-v1", "--agent", "ppo", option, value])
+
+
 def test_settings_of_training_do_not_change_an_evaluation(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

@@ -27,9 +27,11 @@ from dora.agents.collecting.rollouts import Rollouts
 from dora.agents.collecting.task_env import EpisodeEnds
 from dora.agents.config import PPOConfig, RunConfig, SACConfig
 from dora.agents.evaluation import play
+from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.evaluation.play import evaluate_checkpoint, record
 from dora.agents.learners.networks import last_layer
 from dora.agents.learners.ppo import PPO
+from dora.agents.runs import trainer
 from dora.agents.runs.logging import FILM, LAYOUT, TAGS, add_film, tags_table
 from dora.agents.runs.progress_table import read_progress
 from dora.agents.runs.run_folder import RunFolder
@@ -188,6 +190,26 @@ def test_time_spent_with_saving_is_time_of_the_run(tmp_path: Path, monkeypatch: 
     passed = time.perf_counter() - start
     assert len(saved) > 2
     assert 0.2 * len(saved) < result["wall_seconds"] < passed
+
+
+def test_time_of_the_start_and_of_an_evaluation_that_is_interrupted_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def interrupted(*_: Any) -> Any:
+        time.sleep(0.5)
+        raise KeyboardInterrupt
+
+    make = trainer.make_learner
+
+    def slowly(*arguments: Any) -> Any:
+        time.sleep(0.5)
+        return make(*arguments)
+
+    monkeypatch.setattr(Evaluators, "run", interrupted)
+    monkeypatch.setattr(trainer, "make_learner", slowly)
+    result = run(tmp_path / "run", dataclasses.replace(BASE, total_steps=500, eval_every=10_000))
+    assert not result["finished"]
+    assert result["wall_seconds"] > 1.0
 
 
 @pytest.mark.slow

@@ -145,9 +145,11 @@ if __name__ == "__main__":
 """A program that looks at the registry in a process of its own."""
 
 
-def test_the_import_registers_everything_in_a_process_that_a_command_starts(tmp_path: Path):
+@pytest.mark.parametrize("words", [[], ["run", "--total-steps", "1000", "--episodes", "20"]])
+def test_the_import_registers_everything_in_a_process_that_a_command_starts(tmp_path: Path, words: list[str]):
+    """Whose own command line may be shorter than the arguments that it gets."""
     (tmp_path / "dora").write_text(SPAWNING)
-    result = subprocess.run([sys.executable, tmp_path / "dora"], capture_output=True, text=True, cwd=tmp_path)
+    result = subprocess.run([sys.executable, tmp_path / "dora", *words], capture_output=True, text=True, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
 
 

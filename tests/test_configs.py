@@ -88,6 +88,11 @@ def test_stored_numbers_under_another_preset_are_those_of_that_preset(env_id: st
     assert options_under_preset(env_id, {"guidance": "none"}, preset) == {"guidance": "none", "preset": preset}
 
 
+def test_a_whole_configuration_can_be_put_under_another_preset():
+    options = options_under_preset("DoraJug-v1", {"config": task_config(JugConfig, "standard", None)}, "hard")
+    assert options == {"preset": "hard", "config": plain(task_config(JugConfig, "hard", None))}
+
+
 def test_a_number_that_was_chosen_stays_under_another_preset():
     own = {"pose_filter": 0.4, "lift": 0.12}
     options = options_under_preset("DoraJug-v1", {"preset": "hard", "config": own}, "standard")

@@ -23,7 +23,8 @@ from dora.policies.bundle import PAGE, cards_table, check_agrees, chosen, is_bun
 from dora.policies.card import Card, failure_causes
 from dora.policies.policy import bundled_files, bundled_ids, load_policy
 from dora.tables import wilson
-from dora.tasks import task_ids
+from dora.tasks import find_task, task_ids
+from dora.tasks.env.options import task_config
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "results" / "tasks"
@@ -197,6 +198,16 @@ def test_a_card_agrees_with_the_run_that_it_names(env_id: str) -> None:
         assert word in str(card)
 
 
+def test_another_preset_brings_its_numbers_to_the_environment_of_a_policy() -> None:
+    policy = load_policy("DoraJug-v1")
+    config = task_config(find_task("DoraJug-v1").CONFIG, "hard", None)
+    other = dataclasses.replace(config, pose_filter=0.5)
+    for options, wanted in (({}, config), ({"config": {"pose_filter": 0.5}}, other)):
+        env: Any = policy.make(1, preset="hard", **options)
+        assert env.unwrapped.config == wanted
+        env.close()
+
+
 @pytest.mark.parametrize("env_id", task_ids())
 def test_the_bundled_policy_is_the_one_that_training_evaluated_best(env_id: str) -> None:
     """Whatever its success on the starts of the table is."""
@@ -225,16 +236,18 @@ def test_the_best_evaluation_during_training_is_chosen_and_not_the_best_result(t
     assert choice.among == len(best)
 
 
-def test_a_run_that_was_only_evaluated_again_comes_last() -> None:
+def test_a_run_that_was_only_evaluated_again_comes_last_but_for_one_of_earlier_rules() -> None:
     runs = find_runs(RESULTS)
     choice = chosen(runs, "DoraCube-v1")
     assert choice is not None
-    marked = [
-        dataclasses.replace(run, result=run.result | {"checkpoint": "x"}) if run is choice.run else run for run in runs
-    ]
-    other = chosen(marked, "DoraCube-v1")
+    again = dataclasses.replace(choice.run, result=choice.run.result | {"checkpoint": "x"})
+    other = chosen([again if run is choice.run else run for run in runs], "DoraCube-v1")
     assert other is not None
     assert other.run.folder != choice.run.folder
+    outdated = dataclasses.replace(other.run, outdated=True)
+    last = chosen([again, outdated], "DoraCube-v1")
+    assert last is not None
+    assert last.run is again
 
 
 COLUMNS = EpisodeColumns.of(

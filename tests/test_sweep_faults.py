@@ -1,6 +1,7 @@
 """Sweeps that meet what they cannot use: other budgets, evaluations, broken folders, other processes, full disks."""
 
 import fcntl
+import json
 import os
 from pathlib import Path
 
@@ -73,6 +74,19 @@ def test_a_run_that_ends_as_another_one_has_failed(tmp_path: Path):
     sweep.run(LocalLauncher(lambda folder, zero: wrong), nothing, nothing)
     assert states(sweep) == [State.FAILED]
     assert sweep.entries[0].complaint == NOT_THE_RUN
+
+
+def test_why_a_run_of_a_smaller_budget_could_not_be_gone_on_with_is_told(tmp_path: Path):
+    """Its result of before is finished, but not the one that is wanted."""
+    (row,) = short_rows(2000)
+    prepare(row, tmp_path / row.name)
+    words = fake("well").command(tmp_path / row.name, True)
+    smaller = json.loads(words[-1]) | {"total_steps": 1000}
+    (tmp_path / row.name / "result.json").write_text(json.dumps(smaller))
+    sweep = Sweep([row], tmp_path)
+    sweep.run(fake("fails"), nothing, nothing)
+    assert states(sweep) == [State.FAILED]
+    assert sweep.entries[0].complaint == "status 1: the disk is full"
 
 
 def test_a_disk_that_fills_up_fails_one_run_and_not_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

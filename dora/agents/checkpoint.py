@@ -87,7 +87,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     if header.get("config_digest") not in stored_digests(settings):
         raise InputError(f"{path} has settings that were changed (their digest differs): use another checkpoint.")
     try:
-        check(config)
+        check(config, stored=True)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     agents = checked_agents(

@@ -25,7 +25,7 @@ RUN = {
     "workers": (0, 512),
     "learner_threads": (1, 512),
     "eval_every": (1, 10**12),
-    "eval_episodes": (1, 100_000),
+    "eval_episodes": (1, STARTS),
     "final_episodes": (1, STARTS),
     "eval_envs": (1, 100_000),
     "stop_success": (0, 1),
@@ -71,21 +71,29 @@ LEARNER = {
     "log_std_max": (-30, 10),
 }
 """Lowest and highest value of the settings of learners."""
+EARLIER = {"final_episodes": (1, 10**6), "eval_episodes": (1, 100_000), "log_std": (-30, 10), "log_std_min": (-30, 10)}
+"""Wider ranges of earlier versions, whose files can be read still."""
 ORDERED = (("learning_rate_min", "learning_rate_max"), ("log_std_min", "log_std"))
 """Settings of learners of which the first may not be larger than the second."""
 FLAGS = {"final_episodes": "episodes"}
 """Options whose name is not that of their setting."""
 
 
-def check(config: RunConfig) -> None:
+def check(config: RunConfig, stored: bool = False) -> None:
     """Refuse settings that make no sense or for which no machine is large enough.
+
+    Args:
+        config: settings.
+        stored: they are those of a file, perhaps of an earlier version.
 
     Raises:
         InputError: naming the option of the first of them.
     """
-    check_ranges(config, RUN, lambda name: f"--{FLAGS.get(name, name).replace('_', '-')}")
+    wider = EARLIER if stored else {}
+    run, learner = ({name: wider.get(name, own) for name, own in ranges.items()} for ranges in (RUN, LEARNER))
+    check_ranges(config, run, lambda name: f"--{FLAGS.get(name, name).replace('_', '-')}")
     check_finite(config.learner, "learner")
-    check_ranges(config.learner, LEARNER, lambda name: f"--learner.{name.replace('_', '-')}")
+    check_ranges(config.learner, learner, lambda name: f"--learner.{name.replace('_', '-')}")
     for low, high in ORDERED:
         least, most = getattr(config.learner, low, None), getattr(config.learner, high, None)
         if least is not None and most is not None and least > most:

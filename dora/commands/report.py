@@ -8,8 +8,7 @@ import tyro
 
 from dora.agents.reports.report import write_report
 from dora.errors import command
-from dora.tasks import find_task, task_ids
-from dora.tasks.env.options import task_config
+from dora.tasks import present_rules
 
 
 @dataclass
@@ -26,7 +25,6 @@ class Arguments:
 def main() -> int:
     """Run the command; returns the exit status."""
     arguments = tyro.cli(Arguments, description=__doc__)
-    rules = {env_id: task_config(find_task(env_id).CONFIG, "standard", None).definition for env_id in task_ids()}
-    for path in write_report(arguments.dir, arguments.out or arguments.dir, rules):
+    for path in write_report(arguments.dir, arguments.out or arguments.dir, present_rules()):
         print(path)
     return 0

@@ -117,8 +117,10 @@ def parse(words: Sequence[str]) -> Args[dict[str, Any], Any, str]:
     default = Args(run=replace(base, task=numbers), zero_correction=not first.eval_only)
     args = tyro.cli(form, default=default, description=__doc__, args=list(words))
     numbers = task_config(task.CONFIG, args.run.preset, args.run.task)
+    if args.eval_only:  # by the rules of now, whichever the policy was trained by
+        numbers = replace(numbers, definition=task_config(task.CONFIG, args.run.preset, None).definition)
     config = replace(args.run, task=plain(numbers))
-    check(config)
+    check(config, stored=first.resume is not None or first.checkpoint is not None)
     guidance_in_force(config.guidance, config.guidance_parts)
     if not args.eval_only:
         return replace(args, run=config)

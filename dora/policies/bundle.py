@@ -2,8 +2,9 @@
 
 It takes for each task the run whose evaluation during training was the best (success, then return), among runs with
 full guidance, the usual reward, the preset `standard` and the task's own switches. Runs that were only evaluated again,
-whose training saw other definitions, come last. The figures of its card are those of the run's `result.json`; what the
-policy fails at is counted here, on the same starts. `docs/policies.md` is made of the cards.
+whose training saw other definitions, come after them, and results of earlier rules last. The figures of its card are
+those of the run's `result.json`; what the policy fails at is counted here, on the same starts. `docs/policies.md` is
+made of the cards.
 """
 
 import datetime
@@ -26,7 +27,7 @@ from dora.files import make_folder, write_bytes
 from dora.policies.card import HEADINGS, SECONDS_PER_MINUTE, Card, failure_causes
 from dora.policies.policy import bundled_files, bundled_ids
 from dora.tables import markdown_table, wilson
-from dora.tasks import find_task, make_task, task_ids
+from dora.tasks import find_task, make_task, present_rules, task_ids
 from dora.tasks.env.options import task_config
 from dora.tools.task_pages import refreshed
 from dora.version import source_commit
@@ -70,7 +71,7 @@ def main() -> int:
     """Run the command; returns the exit status."""
     args = tyro.cli(Annotated[Args, tyro.conf.arg(name="")], description=__doc__)
     commit = source_commit()  # before files of the checkout are replaced
-    runs = find_runs(args.results)
+    runs = find_runs(args.results, present_rules())
     for env_id in args.env or task_ids():
         if (choice := chosen(runs, env_id)) is None:
             if args.env:
@@ -88,16 +89,20 @@ def main() -> int:
 
 
 def chosen(runs: list[Run], env_id: str) -> Choice | None:
-    """The run of a task whose evaluation during training was the best; None if there is none that a bundle may hold."""
+    """The run of a task whose evaluation during training was the best; None if there is none that a bundle may hold.
+
+    Runs of earlier rules come last, and before these those that were evaluated again.
+    """
     found = []
     for run in runs:
         if run.result["env"] == env_id and (run.folder / POLICY).is_file():
             checkpoint = read_checkpoint(run.folder / POLICY)
             if is_usual(checkpoint.config) and checkpoint.progress.get("best"):
-                found.append((not run.result.get("checkpoint"), checkpoint.progress["best"], run, checkpoint))
+                age = not run.outdated, not run.result.get("checkpoint")
+                found.append(((*age, checkpoint.progress["best"]), run, checkpoint))
     if not found:
         return None
-    *_, run, checkpoint = max(found, key=lambda item: item[:2])
+    _, run, checkpoint = max(found, key=lambda item: item[0])
     return Choice(run, checkpoint, len(found))
 
 

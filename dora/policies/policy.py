@@ -19,7 +19,7 @@ from dora.configs import plain
 from dora.errors import InputError, shown
 from dora.policies.card import Card
 from dora.sim.robot_agent import CONTROL_MODES
-from dora.tasks import check_task_id, find_task, task_ids
+from dora.tasks import check_task_id, find_task, options_under_preset, task_ids
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.env.options import task_config
 from dora.tasks.mdp.guidance_parts import GUIDANCE, OBSERVATION, PRIOR, REGION, guidance_in_force
@@ -62,9 +62,16 @@ class TaskPolicy:
 
         Args:
             num_envs: environments in the batch.
-            options: further arguments of `gym.make`; they stand in the place of `env_kwargs`.
+            options: further arguments of `gym.make`; they stand in the place of `env_kwargs`. A `preset` without a
+                `config` brings its own numbers.
+
+        Raises:
+            InputError: for any option that the task refuses.
         """
-        return gym.make(self.env_id, num_envs=num_envs, **(self.env_kwargs | options))
+        own = self.env_kwargs
+        if "preset" in options and "config" not in options:
+            own = options_under_preset(self.env_id, own, options["preset"])
+        return gym.make(self.env_id, num_envs=num_envs, **(own | options))
 
     def __call__(self, obs: Any) -> Any:
         """The action in [-1, 1] for an observation of `obs_mode="state"`.

@@ -129,8 +129,11 @@ def steps_of(folder: Path) -> int:
 
 
 def complaint(folder: Path, status: int) -> str | None:
-    """What went wrong in a run whose process has ended; None if it is finished."""
-    return None if is_finished(folder) else f"status {status}: {last_words(folder)}"
+    """What went wrong in a run whose process has ended; None if that ended well and left a result.
+
+    A result alone says little: it may be that of a smaller budget, with which the process has failed to go on.
+    """
+    return None if status == 0 and is_finished(folder) else f"status {status}: {last_words(folder)}"
 
 
 @dataclass

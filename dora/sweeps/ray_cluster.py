@@ -20,7 +20,7 @@ from dora.configs import plain
 from dora.errors import InputError
 from dora.files import write_bytes
 from dora.sweeps.finished import finished_runs, result_of
-from dora.sweeps.launching import LOG, Command, Launcher, complaint, is_locked, prepare, resuming
+from dora.sweeps.launching import LOG, NOT_THE_RUN, Command, Launcher, complaint, is_locked, prepare, resuming
 from dora.sweeps.plan import WORKERS, Row
 
 SENT = (
@@ -134,11 +134,16 @@ def train_there(
     prepare(row, place)
     while is_locked(place):  # the process of a worker that died goes on with the run
         time.sleep(LOCK_SECONDS)
-    if result_of(row, finished_runs([place], strict=False)) is None:  # none yet, or one of a smaller budget
+    if _is_missing(row, place):
         status = _trained(place, command(place, zero))
-        if wrong := complaint(place, status):
-            raise RuntimeError(wrong)
+        if _is_missing(row, place):
+            raise RuntimeError(complaint(place, status) or NOT_THE_RUN)
     return {} if shared else {name: (place / name).read_bytes() for name in SENT if (place / name).is_file()}
+
+
+def _is_missing(row: Row, place: Path) -> bool:
+    """Whether a folder has no result of a run with its whole budget."""
+    return result_of(row, finished_runs([place], strict=False)) is None
 
 
 def _trained(place: Path, words: Sequence[str]) -> int:

@@ -140,11 +140,10 @@ class Sweep:
 
     def _note_end(self, row: Row, complaint: str | None) -> None:
         entry = next(entry for entry in self.entries if entry.row is row)
-        if complaint is None:
-            self._settle(entry, self._found())
-            if entry.state is State.DONE:
-                return
-        elif is_locked(entry.folder):  # another process was there first, and trains in it
+        self._settle(entry, self._found())
+        if entry.state is State.DONE:
+            return
+        if complaint is not None and is_locked(entry.folder):  # another process was there first, and trains in it
             entry.state, entry.tries = State.ELSEWHERE, entry.tries - 1
             return
         entry.complaint = complaint or NOT_THE_RUN

@@ -7,9 +7,10 @@ from typing import Any
 
 import gymnasium as gym
 
+from dora.configs import plain
 from dora.errors import InputError, suggestion
 from dora.tasks.env.env import DoraEnv
-from dora.tasks.env.options import numbers_under_preset
+from dora.tasks.env.options import numbers_under_preset, task_config
 from dora.tasks.env.registration import TASKS
 from dora.tasks.env.task import Task
 
@@ -45,15 +46,25 @@ def find_task(env_id: str) -> type[Task]:
     return TASKS[env_id]
 
 
+def present_rules() -> dict[str, int]:
+    """Version of the rules of each task, by id (`TaskConfig.definition`)."""
+    return {env_id: task_config(find_task(env_id).CONFIG, "standard", None).definition for env_id in task_ids()}
+
+
 def options_under_preset(env_id: str, options: Mapping[str, Any], preset: str) -> dict[str, Any]:
     """Arguments of a task under another preset than theirs, which stands in the numbers of their `config` as well.
+
+    Args:
+        env_id: a Dora id.
+        options: arguments of the task; `config` may be some of its numbers, or a whole configuration.
+        preset: name of the other one.
 
     Raises:
         InputError: for an unknown id or preset.
     """
     config = options.get("config") or {}
-    earlier = options.get("preset", "standard")
-    numbers = numbers_under_preset(find_task(env_id).CONFIG, config, earlier, preset)
+    known = config if isinstance(config, Mapping) else plain(config)
+    numbers = numbers_under_preset(find_task(env_id).CONFIG, known, options.get("preset", "standard"), preset)
     return {**options, "preset": preset, **({"config": numbers} if numbers else {})}
 
 

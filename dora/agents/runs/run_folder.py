@@ -219,7 +219,7 @@ class RunFolder:
             raise InputError(f"{self.path} is not a run folder (no readable config.yaml): give one that a run printed.")
         config = config_from_dict(read_yaml(path, "file of settings"), f"the settings in {path}")
         try:
-            check(config)
+            check(config, stored=True)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         return config

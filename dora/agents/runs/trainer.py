@@ -81,6 +81,7 @@ class Trainer:
         zero: bool = True,
         cluster: bool = False,
     ):
+        self._others, self._looked = OtherLoad(), time.perf_counter()
         self.config, self.make_task, self.folder, self._zero, self._cluster = config, make_task, folder, zero, cluster
         torch.set_num_threads(config.learner_threads)
         os.environ[RECORDS] = str(folder.nonfinite.absolute())  # processes that are started later see it, too
@@ -111,7 +112,6 @@ class Trainer:
                 case the state is saved; `result.json` has `finished` false.
         """
         evaluation, zero, finished = None, None, False
-        self._others, self._looked = OtherLoad(), time.perf_counter()
         with Interrupt() as interrupt:
             self.folder.mark_unfinished()
             log = RunLog(self.folder.path, self.counters.env_steps, self.config)
@@ -151,6 +151,7 @@ class Trainer:
         return evaluation, zero
 
     def _write_result(self, evaluation: Evaluation | None, zero: Evaluation | None, finished: bool) -> dict[str, Any]:
+        self._take_time()
         counters = self.counters
         result = make_result(
             self.config,
@@ -334,6 +335,7 @@ class Trainer:
             InputError: if the disk is full; the previous checkpoint survives.
             RunFailure: if something in it is not finite; the previous checkpoint survives.
         """
+        self._take_time()
         replay = self.learner.replay
         tensors = pack_modules(self.learner.modules) | pack_optimisers(self.learner.optimisers) | pack_rng()
         check_tensors(tensors)
