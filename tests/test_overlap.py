@@ -23,7 +23,7 @@ OVEN = ("handle", "door", "body")
 BOTH = [(arm, name) for arm in (LEFT, RIGHT) for name in (*OVEN, "cube")]
 PAIRS = [*BOTH, (LEFT, RIGHT), ("cube", "door"), ("cube", "body")]
 """What may meet in the task of the microwave, besides the table and an arm with itself."""
-HIDDEN = {"DoraMicrowave-v1": 0.3, "DoraJug-v1": 1.6}
+HIDDEN = {"DoraMicrowave-v1": 0.3, "DoraJug-v1": 1.6, "DoraHammer-v1": 0.3}
 """Largest 90th percentile of an episode's true overlap less the reported one [mm]."""
 
 
@@ -71,9 +71,9 @@ def test_persistent_contacts_let_fingers_into_the_cube():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("env", "n"), [("DoraMicrowave-v1", 8), ("DoraJug-v1", 32)])
-def test_persistent_contacts_hide_no_more_than_was_measured(env: str, n: int):
-    """Jug and microwave keep them, so that some overlap is deeper than reported (docs/findings.md)."""
+@pytest.mark.parametrize(("env", "n"), [("DoraMicrowave-v1", 8), ("DoraJug-v1", 32), ("DoraHammer-v1", 12)])
+def test_contacts_hide_no_more_than_was_measured(env: str, n: int):
+    """Jug and microwave keep them, and some overlap is deeper than reported; little of the hammer's (findings.md)."""
     reported, true = reported_and_true(env, n)
     assert np.quantile(true - reported, 0.9) <= HIDDEN[env]
 

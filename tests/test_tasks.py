@@ -146,7 +146,8 @@ def test_state_round_trip_restores_stage_observation_and_future(batch: DoraEnv):
     assert all(torch.equal(now, state["machine"][name]) for name, now in batch.machine.get_state().items())
     torch.testing.assert_close(batch.get_obs(batch.get_info()), seen, atol=5e-3, rtol=0.02)
     batch.step(batch.scripted_action())
-    # PhysX remembers friction from step to step and no state holds it: fingers that lean on one another slip. Where none do, joints [rad] are within 1e-7, and objects [m], which lie or fall, within 2e-6.
+    # PhysX remembers friction from step to step and no state holds it: fingers that lean on one another slip. Where
+    # none do, joints [rad] are within 1e-7, and objects [m], which lie or fall, within 2e-6.
     now, free = batch.snapshot, ~(touching | touching_itself(batch))
     for name in after.objects:
         torch.testing.assert_close(now.objects[name].p, after.objects[name].p, atol=1e-5, rtol=0)
