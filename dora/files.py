@@ -18,7 +18,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from dora.errors import InputError
+from dora.errors import InputError, shown
 from dora.reading import check_size, parse_json
 
 METADATA = "metadata"
@@ -83,6 +83,35 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
         raise InputError(f"Cannot make the folder {folder} ({error}): choose another one.") from error
+
+
+def check_name(path: Path) -> None:
+    """Refuse a path that libraries which write there cannot take.
+
+    Raises:
+        InputError: it is not UTF-8.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"The name {os.fsencode(path)!r} is not in UTF-8: choose another one.") from None
+
+
+def check_new_name(path: Path) -> None:
+    """Refuse a path at which something is, or at which nothing can be made for its name alone.
+
+    Raises:
+        InputError: it exists, is too long, or is not UTF-8.
+    """
+    check_name(path)
+    try:
+        os.lstat(path)
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{shown(str(path))} cannot be made ({reason}): choose another one.") from error
+    raise InputError(f"{path} exists already: choose another folder, or remove it.")
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -3,6 +3,7 @@
 A reader of its output that goes away, as `head` does, ends it without any.
 """
 
+import io
 import os
 import select
 import signal
@@ -18,6 +19,8 @@ GRACE = 20.0
 """Time that a command has for its end after a signal [s]."""
 UNREAD = 128 + signal.SIGPIPE
 """Exit status when nobody reads what a command prints."""
+UNWRITTEN = 1
+"""Exit status when what a command prints cannot be written."""
 _saying, _said = threading.RLock(), False
 """Held while the line about a signal is printed, in a handler that another signal may interrupt; whether it was."""
 
@@ -83,7 +86,11 @@ def _watch(reading: int) -> None:
 
 
 def printing(main: Callable[[], int]) -> int:
-    """Exit status of a command that prints; without a traceback where nobody reads it any more."""
+    """Exit status of a command that prints; without a traceback where nobody reads it any more, where the disk is full
+    to which it goes, or where a terminal lacks letters, which are shown as escapes."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         try:
             return main()
@@ -93,8 +100,29 @@ def printing(main: Callable[[], int]) -> int:
     except BrokenPipeError:
         if sys.stdout is None or _is_read(sys.stdout):
             raise  # another pipe has broken
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is left to print
+        _discard(sys.stdout)
         return UNREAD
+    except OSError as error:
+        if sys.stdout is None or _is_written(sys.stdout):
+            raise  # something else could not be written
+        _discard(sys.stdout)
+        os.write(2, f"What is printed cannot be written ({error.strerror}): make room, or print elsewhere.\n".encode())
+        return UNWRITTEN
+
+
+def _discard(output: TextIO) -> None:
+    """Forget what is left to print."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())
+
+
+def _is_written(output: TextIO) -> bool:
+    """Whether what was printed has arrived, and one more line does."""
+    try:
+        output.flush()
+        os.write(output.fileno(), b"\n")
+    except OSError:
+        return False
+    return True
 
 
 def _is_read(output: TextIO) -> bool:

@@ -49,6 +49,8 @@ def script() -> ModuleType:
         ("--env Nope-v1", "unknown environment 'Nope-v1'"),
         ("--env DoraCub-v1", "did you mean 'DoraCube-v1'?"),
         ("--env DoraCube-v1 --num-envs 0", "--num-envs is 0"),
+        ("--env DoraCube-v1 --guidance x", "unknown guidance 'x'"),
+        ("--env DoraCube-v1 --guidance-parts reward x", "unknown guidance part 'x'"),
         ("--env DoraCube-v1 --total-steps -5", "--total-steps is -5"),
         ("--env DoraCube-v1 --workers -1", "--workers is -1"),
         ("--env DoraCube-v1 --learner.noise-correlation 1", "--learner.noise-correlation is 1.0"),

@@ -191,3 +191,11 @@ def test_closing_leaks_nothing():
         cycle()
     assert process.num_fds() == files
     assert process.memory_info().rss - memory < 8 * 2**20
+
+
+def test_a_step_after_close_is_refused():
+    closed = make("PickCube-v1", 2)
+    closed.reset(seed=0)
+    closed.close()
+    with pytest.raises(InputError, match=r"step\(\) after close\(\)"):
+        closed.step(closed.action_space.sample())

@@ -12,7 +12,7 @@ import pytest
 
 from dora import __main__ as command
 from dora import errors
-from dora.quiet_start import UNREAD, printing
+from dora.quiet_start import UNREAD, UNWRITTEN, printing
 from dora.version import source_commit, version_line
 
 HELP_SECONDS = 0.5
@@ -96,6 +96,32 @@ def test_a_reader_that_goes_away_ends_it_without_a_traceback(words: tuple[str, .
     assert done.returncode == UNREAD
     assert "Traceback" not in done.stderr
     assert "BrokenPipeError" not in done.stderr
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"], ids=["buffered", "unbuffered"])
+@pytest.mark.parametrize("words", [("--help",), ("play", "--help")], ids=" ".join)
+def test_a_full_disk_under_what_is_printed_ends_it_with_a_sentence(words: tuple[str, ...], unbuffered: str):
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([*MODULE, *words], stdout=full, stderr=subprocess.PIPE, text=True, env=environment)
+    assert done.returncode == UNWRITTEN
+    assert done.stderr.splitlines()[-1].startswith("What is printed cannot be written (No space left on device)")
+    assert "Traceback" not in done.stderr
+
+
+def test_something_else_that_cannot_be_written_is_told():
+    def full() -> int:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left"):
+        printing(full)
+
+
+def test_letters_that_a_terminal_lacks_are_shown_as_escapes():
+    code = "import sys; from dora.quiet_start import printing; sys.exit(printing(lambda: print('a ü ─ \\udce9') or 0))"
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert done.stdout == "a \\xfc \\u2500 \\udce9\n", done.stderr
 
 
 def test_a_pipe_of_something_else_that_breaks_is_told(capfd: pytest.CaptureFixture[str]):

@@ -22,7 +22,7 @@ from dora import parallel
 from dora.configs import plain
 from dora.datasets.episodes import Plan, make_batch, roll_out
 from dora.datasets.facts import facts_of
-from dora.datasets.record import FORMATS, new_folder, record_dataset
+from dora.datasets.record import FORMATS, check_possible, new_folder, record_dataset
 from dora.datasets.sources import find_source
 from dora.errors import InputError
 from dora.sim import can_render
@@ -182,6 +182,35 @@ def test_what_a_killed_recording_left_is_removed_by_the_next_one(tmp_path: Path,
         assert len(left) == 1
         assert left.pop().startswith(f".{other.name}.")
         shutil.rmtree(target)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("a" * 300, "File name too long"), ("caf\udce9", "not in UTF-8"), ("there", "exists already")]
+)
+def test_a_folder_that_cannot_be_made_is_refused_before_the_work(tmp_path: Path, name: str, words: str):
+    (tmp_path / "there").symlink_to("nowhere")
+    with pytest.raises(InputError, match=words) as error:
+        check_possible("minari", Plan(1), tmp_path / name, pictures=False)
+    assert "\n" not in str(error.value)
+    str(error.value).encode()
+
+
+@pytest.mark.slow
+def test_a_disk_that_fills_up_leaves_nothing(tmp_path: Path):
+    """No file may have more than 100 kB here."""
+    code = f"""
+import resource, signal, sys
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+from dora.commands import demos
+sys.argv = ["demos", {ENV!r}, "--episodes", "4", "--num-envs", "4", "--format", "minari", "--out", "out"]
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+sys.exit(demos.main())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert "File too large" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

@@ -2,8 +2,12 @@
 
 import json
 
+import gymnasium as gym
 import pytest
 from pictures import run_without_driver
+
+from dora.errors import InputError
+from dora.tools.env_benchmark import _Measurement
 
 
 @pytest.mark.slow
@@ -22,3 +26,14 @@ if __name__ == "__main__":
     assert report["env_steps_per_second"] > 0
     assert report["reference_env_steps_per_second"] > 0
     assert sum(report["shares"].values()) == pytest.approx(1, abs=0.01)
+
+
+def test_files_that_are_missing_are_named_where_nobody_answers(monkeypatch: pytest.MonkeyPatch):
+    """ManiSkill asks whether to fetch them."""
+
+    def ask(*_: object, **__: object) -> None:
+        raise EOFError("EOF when reading a line")
+
+    monkeypatch.setattr(gym, "make", ask)
+    with pytest.raises(InputError, match="python -m mani_skill.utils.download_asset OpenCabinetDrawer-v1"):
+        _Measurement("OpenCabinetDrawer-v1", "state", 2, 1.0, None)

@@ -194,6 +194,8 @@ def test_every_run_is_trained_once(tmp_path: Path, jobs: int):
 def test_what_becomes_of_a_run_is_said_in_a_line(tmp_path: Path):
     (row,) = few(1)
     entry = Entry(row, tmp_path / "run")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / LOG).write_text("no")
     said = []
     for state, others in (
         (State.WAITING, {}), (State.RUNNING, {}), (State.WAITING, {"complaint": "status 1: no"}),
@@ -208,9 +210,23 @@ def test_what_becomes_of_a_run_is_said_in_a_line(tmp_path: Path):
         "running (another process)",
     ]  # fmt: skip
     entry.state = State.RUNNING
-    (tmp_path / "run").mkdir()
     (tmp_path / "run" / "progress.csv").write_text("env_steps,seconds\n7,1\n")
     assert _news(entry) == "goes on"
+
+
+def test_why_a_run_could_not_be_begun_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """It has failed before the first look at it."""
+
+    def full(row: Row, folder: Path) -> None:
+        raise InputError("the disk is full.")
+
+    monkeypatch.setattr(dora.sweeps.sweep, "prepare", full)
+    (row,), said = few(1), io.StringIO()
+    sweep = Sweep([row], tmp_path)
+    with Board(Console(file=said, width=1000)) as board:
+        sweep.run(fake("well"), board, nothing)
+    assert states(sweep) == [State.FAILED]
+    assert f"{row.name}: failed (the disk is full.)\n" in said.getvalue()
 
 
 def test_a_run_that_fails_is_gone_on_with_and_the_others_are_not_held_up(tmp_path: Path):
@@ -307,6 +323,15 @@ def test_what_makes_no_sense_is_refused(
     words: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     assert message in refusal(command, monkeypatch, capsys, f"--dry-run {words}")
+
+
+def test_a_file_in_the_place_of_its_folder_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "file").write_text("")
+    for words in ("", "--dry-run"):
+        assert "is not a folder" in refusal(command, monkeypatch, capsys, f"--out {tmp_path / 'file'} {words}")
+    assert "Cannot make the folder" in refusal(command, monkeypatch, capsys, f"--out {tmp_path / 'file' / 'below'}")
 
 
 # ------------------------------------------------------------------- a cluster

@@ -150,6 +150,8 @@ def settings_to_start_from(first: First, words: Sequence[str]) -> RunConfig:
     preset = first.preset
     if preset is not None:
         find_preset(preset)
+    guidance_in_force(first.guidance or "affordance", None)
+    guidance_in_force("affordance", first.guidance_parts)
     if first.eval_only and first.checkpoint is None and not (first.zero_correction and first.env is not None):
         raise InputError(
             "--eval-only needs --checkpoint with a .safetensors file or a run folder, or --zero-correction with --env."

@@ -19,6 +19,7 @@ import tyro
 
 from dora.agents.runs.interrupt import STATUS, Interrupt
 from dora.errors import InputError, command
+from dora.files import make_folder
 from dora.sweeps.board import Board, print_all, summary
 from dora.sweeps.launching import Launcher, LocalLauncher
 from dora.sweeps.plan import rows_of
@@ -71,6 +72,10 @@ def main() -> int:
     chosen = {"envs": args.env, "agents": args.agent, "guidance": args.guidance, "seeds": args.seeds}
     rows = rows_of(args.preset, total_steps=args.total_steps, episodes=args.episodes, **chosen)
     out = args.out or Path("runs") / f"sweep-{args.preset}"
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out {out} is not a folder: choose another one.")
+    if not args.dry_run:
+        make_folder(out)
     sweep = Sweep(rows, out, args.known, args.jobs, args.retries)
     if args.dry_run:
         print_all(sweep)

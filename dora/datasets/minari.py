@@ -3,6 +3,7 @@
 The format is that of Minari 0.5 (https://minari.farama.org), written with h5py.
 """
 
+import io
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -58,11 +59,12 @@ def write_minari(
         episodes: in the order in which they are stored.
     """
     (folder / DATA).parent.mkdir()
-    steps = count = 0
-    with h5py.File(folder / DATA, "w", track_order=True) as file:
+    steps, count, content = 0, 0, io.BytesIO()  # of a file on a disk that fills up the library does not let go
+    with h5py.File(content, "w", track_order=True) as file:
         for count, episode in enumerate(episodes, 1):
             _write_episode(file.create_group(f"episode_{count - 1}"), count - 1, episode)
             steps += len(episode)
+    (folder / DATA).write_bytes(content.getbuffer())
     spec = EnvSpec(
         facts.env_id,
         entry_point=f"{__name__}:{recovered.__name__}",

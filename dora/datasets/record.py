@@ -19,7 +19,7 @@ from dora.datasets.lerobot import write_lerobot
 from dora.datasets.minari import write_minari
 from dora.datasets.tables import require_pyarrow
 from dora.errors import InputError
-from dora.files import make_folder, write_json
+from dora.files import check_new_name, make_folder, write_json
 from dora.parallel import folder_beside
 from dora.sim.batch.rendering import can_render
 from dora.version import version_line
@@ -58,8 +58,7 @@ def check_possible(kind: str, plan: Plan, folder: Path, pictures: bool) -> None:
     if not 0 <= plan.seed <= LARGEST_SEED - 100 * plan.episodes:
         first = f"the seed of the first start is {plan.seed}"
         raise InputError(f"{first}; those of all have to be from 0 to {LARGEST_SEED}.")
-    if os.path.lexists(folder):
-        raise InputError(f"{folder} exists already: choose another folder, or remove it.")
+    check_new_name(folder)
     if kind == "lerobot":
         require_pyarrow()
     if pictures and kind == "minari":

@@ -8,6 +8,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from dora.sweeps.launching import LOG
 from dora.sweeps.sweep import Entry, State, Sweep
 from dora.tables import text_table
 
@@ -73,7 +74,8 @@ class Board:
     def __call__(self, sweep: Sweep) -> None:
         """Show how it stands."""
         for index, entry in enumerate(sweep.entries):
-            if index in self._states and self._states[index] is not entry.state:
+            before = self._states.get(index)
+            if before is not entry.state and (before is not None or entry.state is State.FAILED):
                 self._say(f"{entry.row.name}: {_news(entry)}")
             self._states[index] = entry.state
         if self._console.is_terminal:
@@ -95,7 +97,8 @@ def _news(entry: Entry) -> str:
     if entry.state is State.RUNNING:
         return "goes on" if entry.env_steps else "begins"
     if entry.state is State.FAILED:
-        return f"failed ({entry.complaint}); what it printed is in {entry.folder}/output.log"
+        printed = entry.folder / LOG
+        return f"failed ({entry.complaint})" + (f"; what it printed is in {printed}" if printed.is_file() else "")
     return f"will be tried again ({entry.complaint})" if entry.complaint else entry.state.value
 
 

@@ -126,7 +126,13 @@ class _Measurement:
 
     def __init__(self, env_id: str, obs_mode: str, num_envs: int, seconds: float, together: Any):
         torch.set_num_threads(1)
-        self.env: Any = gym.make(env_id, num_envs=num_envs, sim_backend=BACKEND, **_options(obs_mode))
+        try:
+            self.env: Any = gym.make(env_id, num_envs=num_envs, sim_backend=BACKEND, **_options(obs_mode))
+        except EOFError:  # ManiSkill asks whether to download them, and there is nobody to answer
+            raise InputError(
+                f"{env_id} needs files that are not there: fetch them by "
+                f"python -m mani_skill.utils.download_asset {env_id}"
+            ) from None
         self.num_envs, self.seconds, self.together = num_envs, seconds, together
 
     def __call__(self, seed: int) -> _Measured:

@@ -19,7 +19,7 @@ from dora.agents.limits import check
 from dora.agents.runs.stored_results import MOST_RESULT
 from dora.configs import plain
 from dora.errors import InputError
-from dora.files import write_bytes, write_csv, write_json
+from dora.files import check_name, write_bytes, write_csv, write_json
 from dora.reading import read_json, read_yaml
 from dora.version import VERSION, source_commit
 
@@ -111,6 +111,7 @@ class RunFolder:
         Raises:
             InputError: if it holds a run already, or cannot be made or written.
         """
+        check_name(self.path)
         try:
             found = [name for name in OWN_FILES if (self.path / name).exists()]
             above = next(path for path in (self.path, *self.path.absolute().parents) if path.exists())

@@ -224,6 +224,8 @@ def _step(original: Callable) -> Callable:
         """ManiSkill's step, in which environments whose state becomes bad are put back and terminated."""
         if not runs_batched(self):
             return original(self, action)
+        if self.scene is None:
+            raise InputError("step() after close(): make the environment again.")
         guard: StateGuard = self.scene.px.guard  # pyright: ignore[reportAttributeAccessIssue]
         guard.begin(action)
         result, rows = marked(original(self, action), torch.from_numpy(guard.found))
