@@ -35,5 +35,5 @@ def test_files_that_are_missing_are_named_where_nobody_answers(monkeypatch: pyte
         raise EOFError("EOF when reading a line")
 
     monkeypatch.setattr(gym, "make", ask)
-    with pytest.raises(InputError, match="python -m mani_skill.utils.download_asset OpenCabinetDrawer-v1"):
+    with pytest.raises(InputError, match=r"python -m mani_skill.utils.download_asset OpenCabinetDrawer-v1"):
         _Measurement("OpenCabinetDrawer-v1", "state", 2, 1.0, None)
