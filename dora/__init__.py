@@ -38,9 +38,9 @@ def load_policy(which: "str | _Path") -> "TaskPolicy":
 
 
 def _is_command() -> bool:
-    """Whether Python starts `dora`, `python -m dora` or a file of `experiments/`: these register when they need it.
+    """Whether Python starts `dora`, `python -m dora` or a script of a checkout that does the same: they register later.
 
-    Those files say that they are `dora` (`sys.argv[0]`). A process that such a command starts has its `argv`, but not
+    Those scripts say that they are `dora` (`sys.argv[0]`). A process that such a command starts has its `argv`, but not
     its command line, and registers everything.
     """
     program, arguments = _sys.argv[0], _sys.argv[1:]
