@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from invented_microwave import YAW, in_world, invented, out, turned
+from placements import grasps
 from torch import Tensor
 
 import dora.tasks as tasks
@@ -22,6 +23,7 @@ from dora.geometry.rotations import (
 from dora.robot import load_robot
 from dora.tasks.microwave import mdp
 from dora.tasks.microwave.mdp import MicrowaveConfig
+from dora.tasks.microwave.reach import STEP, placing_way
 from dora.tasks.microwave.reference import OpenSettings, PlaceSettings, entry_turn, opening, placing, with_door
 from dora.tasks.microwave.snapshot import CAVITY, LEFT, RIGHT, MicrowaveSnapshot, cube_in_oven, hands_out, inside
 from dora.tasks.microwave.task import MicrowaveTask, mirrored, oven_mount
@@ -33,6 +35,16 @@ STARTS = 100
 
 
 # ---------------------------------------------------------------------- geometry
+
+
+def test_the_way_into_the_cavity_is_followed_in_small_steps():
+    candidates = grasps(load_robot("diana7_hit"), load_object("cube"), 1)
+    turn = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+    way = placing_way(0.2, 0.1, 0.15)(candidates, torch.zeros(1, 3), turn)
+    places = torch.stack([p[0, 0] for p, _ in way])
+    steps = places.diff(dim=0)
+    assert float(steps.norm(dim=-1).max()) <= STEP + 1e-6
+    torch.testing.assert_close(steps.sum(0), torch.tensor([0.3, 0.0, 0.0]))
 
 
 def test_points_are_seen_from_the_microwave_wherever_it_stands():

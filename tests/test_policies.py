@@ -318,6 +318,7 @@ def test_a_card_survives_its_file_and_damage_is_refused(tmp_path: Path) -> None:
     card.write(tmp_path / "card.json")
     assert Card.read(tmp_path / "card.json") == card
     assert card.failures == {"too much overlap": 1}
+    assert card.overlap_limit_mm == pytest.approx(3.0)
     content = json.loads((tmp_path / "card.json").read_text())
     for damaged in (content | {"seed": "one"}, {k: v for k, v in content.items() if k != "seed"}, [content]):
         (tmp_path / "card.json").write_text(json.dumps(damaged))

@@ -334,6 +334,18 @@ def test_a_file_in_the_place_of_its_folder_is_refused_before_any_work(
     assert "Cannot make the folder" in refusal(command, monkeypatch, capsys, f"--out {tmp_path / 'file' / 'below'}")
 
 
+def test_a_sweep_that_is_interrupted_ends_as_by_that_signal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Sweep, "run", interrupted)
+    words = ("--env", "DoraCube-v1", "--seeds", "3", "--out", str(tmp_path))
+    assert call(command, monkeypatch, *words) == 128 + signal.SIGINT
+    assert "The same command goes on" in capsys.readouterr().err
+
+
 # ------------------------------------------------------------------- a cluster
 
 

@@ -10,6 +10,7 @@ A finished run counts, whichever command made it, if its settings are the same a
 """
 
 import os
+import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,7 +89,7 @@ def main() -> int:
                 sweep.run(launcher, board, interrupt.check)
         except KeyboardInterrupt:
             print(f"Interrupted and saved; {summary(sweep)}. The same command goes on.", file=sys.stderr)
-            return STATUS + (interrupt.number or 0)
+            return STATUS + (interrupt.number or signal.SIGINT)
     print_all(sweep)
     print(out)
     return FAILED if sweep.count(State.FAILED) else 0
