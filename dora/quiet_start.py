@@ -85,12 +85,17 @@ def _watch(reading: int) -> None:
             os._exit(128 + number[0])
 
 
-def printing(main: Callable[[], int]) -> int:
-    """Exit status of a command that prints; without a traceback where nobody reads it any more, where the disk is full
-    to which it goes, or where a terminal lacks letters, which are shown as escapes."""
+def show_any_script() -> None:
+    """Let standard output and error print names in any script: letters that they lack are shown as escapes."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def printing(main: Callable[[], int]) -> int:
+    """Exit status of a command that prints; without a traceback where nobody reads it any more, where the disk is full
+    to which it goes, or where a terminal lacks letters, which are shown as escapes."""
+    show_any_script()
     try:
         try:
             return main()

@@ -5,7 +5,6 @@ Jinja2 escapes what comes from files; rich draws on terminals.
 
 import html
 import io
-import sys
 from collections.abc import Sequence
 
 import jinja2
@@ -26,13 +25,6 @@ _MARKDOWN = _PLAIN.from_string("""\
 | {% for cell in row %}{{ cell | replace("|", "\\\\|") }}{{ " | " if not loop.last }}{% endfor %} |
 {%- endfor %}""")
 """A Markdown table."""
-
-
-def show_any_script() -> None:
-    """Let standard output and error print names in any script: letters that they lack are shown as escapes."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

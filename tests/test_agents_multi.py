@@ -12,7 +12,8 @@ import torch
 from fake_task import TwoPoints
 from matrix_game import ITERATIONS, SEEDS, Game
 from tensordict import TensorDict
-from test_agents_train import BASE, events_of, run, weights
+from test_agents_logs import events_of
+from test_agents_train import BASE, run, weights
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 

@@ -23,7 +23,8 @@ from dora.affordance.objects.surface_repair import Repaired, repair
 from dora.affordance.views.server import legend_html
 from dora.errors import InputError
 from dora.progress import ProgressDisplay
-from dora.tables import markdown_text, show_any_script
+from dora.quiet_start import show_any_script
+from dora.tables import markdown_text
 
 RADIUS, HEIGHT = 0.03, 0.12
 """A cylinder, the body of most meshes here [m]."""

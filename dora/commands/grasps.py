@@ -30,12 +30,12 @@ from dora.arguments import LARGEST_SEED
 from dora.configs import check_ranges
 from dora.errors import InputError, command
 from dora.progress import ProgressDisplay
+from dora.quiet_start import show_any_script
 from dora.robot import load_robot
 from dora.sim.grasp_tests.bundle_maker import make_bundle
 from dora.sim.grasp_tests.failures import hint
 from dora.sim.grasp_tests.generation import baselines, by_region, generate, summary, voting_summary
 from dora.sim.grasp_tests.report import check_out, print_agreement, print_report, write_report
-from dora.tables import show_any_script
 from dora.tools.in_task.ranking import rank_bundled_set, tasks_of, usable_in_task
 from dora.tools.in_task.refining import refine_bundled_set
 

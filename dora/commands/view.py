@@ -29,8 +29,8 @@ from dora.affordance.views.album import write_album, write_objects
 from dora.affordance.views.page import GraspPage
 from dora.configs import check_ranges
 from dora.errors import InputError, command
+from dora.quiet_start import show_any_script
 from dora.robot import RobotDescription, load_robot
-from dora.tables import show_any_script
 
 RANGES = {"port": (1, 65_535), "scale": (1e-9, 1e9)}
 """Lowest and highest value of options."""

@@ -21,7 +21,7 @@ from dora.affordance.objects.folder_writing import check_object_folder, write_ob
 from dora.affordance.objects.importing import import_mesh
 from dora.affordance.objects.models import cube, hammer, jug, microwave
 from dora.errors import InputError, command
-from dora.tables import show_any_script
+from dora.quiet_start import show_any_script
 
 MODELS: dict[str, Callable[[], AffordanceObject]] = {
     "cube": cube.build, "hammer": hammer.build, "jug": jug.build, "microwave": microwave.build,
