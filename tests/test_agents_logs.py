@@ -2,8 +2,12 @@
 
 import contextlib
 import dataclasses
+import errno
 import functools
+import os
 import re
+import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,11 +18,12 @@ import pytest
 import torch
 from fake_task import PointMass
 from short_runs import BASE, SMALL_PPO, run
+from tensorboard.summary.writer.record_writer import RecordWriter
 from torch import Tensor
 
 from dora.agents.evaluation import play
 from dora.agents.evaluation.play import evaluate_checkpoint, record
-from dora.agents.runs.logging import FILM, LAYOUT, TAGS, add_film, tags_table
+from dora.agents.runs.logging import FILM, LAYOUT, TAGS, RunLog, add_film, tags_table
 from dora.agents.runs.run_folder import RunFolder
 
 
@@ -79,6 +84,33 @@ def test_each_chart_of_the_layout_shows_a_tag():
 
 def test_the_page_about_agents_has_the_table_of_tags(project_root: Path):
     assert tags_table() in (project_root / "docs" / "agents.md").read_text()
+
+
+def test_a_full_disk_under_tensorboard_is_one_error_without_a_traceback_of_its_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    shown: list[type[BaseException]] = []
+    monkeypatch.setattr(threading, "excepthook", lambda met: shown.append(met.exc_type))
+    log = RunLog(tmp_path)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(RecordWriter, "write", full)
+
+    def train() -> None:
+        for step in range(1000):
+            log.add("training", {"success_rate": 1.0}, step)
+            time.sleep(0.01)
+
+    with pytest.raises(OSError, match="No space left"):
+        train()
+    log.close()
+    assert not shown
+    other = threading.Thread(target=full)
+    other.start()
+    other.join()
+    assert shown == [OSError]
 
 
 def test_a_film_is_written(tmp_path: Path):

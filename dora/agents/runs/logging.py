@@ -2,6 +2,7 @@
 
 import itertools
 import sys
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 from tensorboard.compat.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboard.summary.writer.event_file_writer import _AsyncWriterThread
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
@@ -102,6 +104,7 @@ class RunLog:
     """
 
     def __init__(self, folder: Path, first_step: int = 0, config: RunConfig | None = None):
+        _silence_writing_thread()
         self._writer = SummaryWriter(str(folder), purge_step=first_step or None)
         self._settings = {} if config is None else flat_settings(config)
         if first_step == 0:
@@ -139,6 +142,19 @@ class RunLog:
             self._writer.close()
         except OSError as error:
             print(f"TensorBoard's events could not all be written ({error.strerror}).", file=sys.stderr)
+
+
+def _silence_writing_thread() -> None:
+    """Show no traceback of TensorBoard's thread for a full disk: the error is raised again where the log is written."""
+    earlier = threading.excepthook
+    if getattr(earlier, "__name__", "") == "_unless_tensorboard":
+        return
+
+    def _unless_tensorboard(met: threading.ExceptHookArgs) -> None:
+        if not (isinstance(met.thread, _AsyncWriterThread) and isinstance(met.exc_value, OSError)):
+            earlier(met)
+
+    threading.excepthook = _unless_tensorboard
 
 
 def flat_settings(config: RunConfig) -> dict[str, str | float | bool]:
