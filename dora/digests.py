@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,6 +11,9 @@ from torch import Tensor
 
 KEY = "digest_key"
 """Key of a field's metadata whose value replaces the field's name in digests, so that it can be renamed."""
+
+SEAL = "digest"
+"""Entry of a JSON object that holds the digest of its other entries."""
 
 
 def digest_of(value: Any) -> str:
@@ -28,6 +32,17 @@ def digest_of(value: Any) -> str:
     digest = hashlib.sha256()
     _feed(digest, value)
     return digest.hexdigest()
+
+
+def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
+    """What JSON keeps of a mapping, with a digest by which `is_whole` finds any change."""
+    entries: dict[str, Any] = {name: value for name, value in json.loads(json.dumps(content)).items() if name != SEAL}
+    return entries | {SEAL: digest_of(entries)}
+
+
+def is_whole(content: Mapping[str, Any]) -> bool:
+    """Whether a mapping that `sealed` made is as it was made."""
+    return content.get(SEAL) == digest_of({name: value for name, value in content.items() if name != SEAL})
 
 
 def _feed(digest: Any, value: Any) -> None:

@@ -144,7 +144,6 @@ def write_result(folder: Path) -> None:
         "eval_episodes": 20, "total_steps": 1000, "first_seed": 5, "preset": "standard", "guidance_parts": ["prior"],
         "raw_success_rate": 0.5, "steps_to_80": None, "stage_rates": {"reach": 0.75},
     }  # fmt: skip
-    (folder / "result.json").write_text(json.dumps(result))
     head = "env_steps,wall_seconds,success_rate,return_mean,penetration_p95_mm,training_success_rate"
     (folder / "curve.csv").write_text(f"{head}\n500,45,0.1,3,2,0.1\n1000,90,0.5,9,nan,0.4\n")
     for name in ("eval.csv", "zero.csv"):
@@ -153,6 +152,7 @@ def write_result(folder: Path) -> None:
     table = ProgressTable(folder / "progress.csv", ["reach"])
     for step in range(100, 1100, 100):
         table.add({"env_steps": step, "seconds": step / 10, "episodes": 3, "success_rate": 0.5, "return_mean": 1.0})
+    RunFolder(folder).write_result(result)
 
 
 def load_results(folder: Path) -> object:
@@ -301,15 +301,15 @@ LOADERS: dict[str, Loader] = {
     "affordance map": Loader(write_map, load_map, sealed=True),
     "config.yaml": Loader(write_config, load_config),
     "config.yaml, first": Loader(write_first_config, load_config),
-    "result.json": Loader(write_result, load_results, ("result.json",)),
+    "result.json": Loader(write_result, load_results, ("result.json",), sealed=True),
     "result.json, marked": Loader(write_result, mark_unfinished, ("result.json",)),
-    "card": Loader(write_card, load_card),
+    "card": Loader(write_card, load_card, sealed=True),
     "mesh of a robot": Loader(write_robot_mesh, load_robot_mesh),
-    "curve.csv": Loader(write_result, load_results, ("curve.csv",)),
-    "progress.csv": Loader(write_result, load_results, ("progress.csv",)),
-    "eval.csv": Loader(write_result, load_report, ("eval.csv", "zero.csv")),
+    "curve.csv": Loader(write_result, load_results, ("curve.csv",), sealed=True),
+    "progress.csv": Loader(write_result, load_results, ("progress.csv",), sealed=True),
+    "eval.csv": Loader(write_result, load_report, ("eval.csv", "zero.csv"), sealed=True),
     "recording": Loader(write_recording, load_recording),
-    "report": Loader(write_result, load_report),
+    "report": Loader(write_result, load_report, ("*.json", "*.csv"), sealed=True),
     "robot.toml": Loader(write_robot, load_robot, ("robot.toml",)),
     "robot.urdf": Loader(write_robot, load_robot, ("robot.urdf",)),
     "parameters.yaml": Loader(write_parameters, write_urdf, ("parameters.yaml",)),

@@ -17,6 +17,7 @@ from dora.agents.checkpoint import read_checkpoint
 from dora.agents.collecting.task_env import EpisodeColumns
 from dora.agents.evaluation.evaluate import Evaluation
 from dora.agents.reports.run_results import find_runs
+from dora.digests import sealed
 from dora.errors import InputError
 from dora.policies import bundle
 from dora.policies.bundle import PAGE, cards_table, check_agrees, chosen, is_bundled, make_card
@@ -329,7 +330,7 @@ def test_a_card_survives_its_file_and_damage_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("name", "value"), [("episodes", 0), ("success_rate", 1.5), ("seed", -1)])
 def test_a_card_with_figures_that_cannot_be_is_refused(tmp_path: Path, name: str, value: float) -> None:
     card = json.loads(bundled_files("DoraCube-v1")[1].read_text())
-    (tmp_path / "card.json").write_text(json.dumps(card | {name: value}))
+    (tmp_path / "card.json").write_text(json.dumps(sealed(card | {name: value})))
     with pytest.raises(InputError, match=f"{name} of the card .* has to be from"):
         Card.read(tmp_path / "card.json")
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from dora.agents.evaluation.evaluate import Evaluation
 from dora.configs import LARGEST, built, check_finite, check_ranges, plain
+from dora.digests import SEAL, is_whole, sealed
 from dora.errors import InputError
 from dora.files import write_json
 from dora.reading import read_json
@@ -87,20 +88,22 @@ class Card:
     """Day on which it was made."""
 
     def write(self, path: Path) -> None:
-        """Write it as JSON, atomically."""
-        write_json(path, plain(self))
+        """Write it as JSON with a digest, atomically."""
+        write_json(path, sealed(plain(self)))
 
     @classmethod
     def read(cls, path: Path) -> "Card":
         """A card as `write` wrote it.
 
         Raises:
-            InputError: if it is missing, too large, has other entries, or figures that cannot be.
+            InputError: if it is missing, too large, has other entries, or figures that cannot be, or was changed.
         """
         content = read_json(path, "card", MOST)
         if not isinstance(content, dict):
             raise InputError(f"{path} is no card of a policy: make it again by python -m dora.policies.bundle.")
-        card = built(cls, content, f"the card {path}")
+        if not is_whole(content):
+            raise InputError(f"the card {path} is damaged (its digest differs): run python -m dora.policies.bundle.")
+        card = built(cls, {name: value for name, value in content.items() if name != SEAL}, f"the card {path}")
         check_finite(card, f"the card {path}")
         check_ranges(card, RANGES, lambda name: f"{name} of the card {path}")
         return card

@@ -16,7 +16,7 @@ import yaml
 from dora.agents.config import RunConfig, config_from_dict
 from dora.agents.evaluation.evaluate import Evaluation
 from dora.agents.limits import check
-from dora.agents.runs.stored_results import MOST_RESULT
+from dora.agents.runs.stored_results import MOST_RESULT, with_digests
 from dora.configs import plain
 from dora.errors import InputError
 from dora.files import check_name, write_bytes, write_csv, write_json
@@ -236,8 +236,8 @@ class RunFolder:
             write_csv(self.path / "zero.csv", *zero.rows())
 
     def write_result(self, result: dict[str, Any]) -> None:
-        """Write `result.json`."""
-        write_json(self.path / "result.json", result)
+        """Write `result.json`, with digests of itself and of the tables in the folder."""
+        write_json(self.path / "result.json", with_digests(result, self.path))
 
 
 def make_result(

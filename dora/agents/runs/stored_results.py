@@ -1,12 +1,15 @@
 """What `result.json` and the tables of a run folder may hold, for those who read them: names, types and ranges."""
 
 import csv
+import hashlib
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from dora.digests import SEAL, is_whole, sealed
 from dora.errors import InputError, shown
-from dora.reading import read_json, read_text
+from dora.reading import read_bytes, read_json, read_text
 
 MOST_RESULT, MOST_TABLE = 1_000_000, 16_000_000
 """Size of a result.json and of a table above which it is not read [bytes]."""
@@ -24,6 +27,10 @@ RISING = ("env_steps", "wall_seconds")
 """Those that never fall from row to row."""
 EPISODE_COLUMNS = ("episode", "success")
 """Columns that an eval.csv has at least."""
+TABLES = ("curve.csv", "progress.csv", "eval.csv", "zero.csv")
+"""Tables of a run folder of which the result holds the digests."""
+OF_TABLES = "table_digests"
+"""Entry of a result with these digests by the table's name."""
 REQUIRED = {
     "env": "text", "agent": "text", "guidance": "text", "env_steps": "count", "wall_seconds": "amount",
     "success_rate": "share", "zero_success_rate": "share or none", "penetration_p95_mm": "amount or none",
@@ -34,7 +41,7 @@ OPTIONAL = {
     "eval_episodes": "count", "total_steps": "count", "first_seed": "count or none", "task": "mapping",
     "other_load": "amount or none", "raw_success_rate": "share or none", "steps_to_80": "count or none",
     "stage_rates": "shares", "seed": "count", "task_config": "mapping or none", "learner_config": "mapping or none",
-    "config_digest": "text",
+    "config_digest": "text", OF_TABLES: "mapping", SEAL: "text",
 }  # fmt: skip
 """The same of entries that results of some versions have."""
 NESTED = {"preset": "text", "guidance_parts": "texts or none"}
@@ -78,11 +85,34 @@ def _check(content: dict[str, Any], entries: dict[str, str], path: Path, require
         )
 
 
+def with_digests(result: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """A result with digests of the tables that lie in its folder now and of itself, which `read_result` compares."""
+    tables = {name: _table_digest(folder / name) for name in TABLES if (folder / name).is_file()}
+    return sealed({**result, OF_TABLES: tables})
+
+
+def _table_digest(path: Path) -> str:
+    """sha256 of a table, the same whichever line ends a tool has given it."""
+    return hashlib.sha256(read_bytes(path, path.name, MOST_TABLE).replace(b"\r\n", b"\n")).hexdigest()
+
+
+def _check_digests(result: dict[str, Any], path: Path) -> None:
+    """Refuse a result that has digests (those of earlier versions have none) and differs from them."""
+    if (SEAL in result or OF_TABLES in result) and not is_whole(result):
+        raise InputError(f"{path} is damaged (its digest differs); repeat the run or remove its folder.")
+    if result.get("finished"):  # else the tables go on
+        for name, digest in result.get(OF_TABLES, {}).items():
+            table = path.with_name(name)
+            if name in TABLES and table.is_file() and _table_digest(table) != digest:
+                raise _damaged(table, "its digest in result.json differs")
+
+
 def read_result(path: Path) -> dict[str, Any] | None:
     """Content of the result.json of a finished run; None of one that did not finish.
 
     Raises:
-        InputError: it is too large, no JSON, or lacks an entry or has one of another type or out of range.
+        InputError: it is too large, no JSON, lacks an entry or has one of another type or out of range, or it or a
+            table beside it was changed after it was written.
     """
     try:
         result = read_json(path, "result.json", MOST_RESULT)
@@ -95,10 +125,12 @@ def read_result(path: Path) -> dict[str, Any] | None:
     if not isinstance(finished, bool):
         raise InputError(f"{path} is damaged (finished is {shown(finished)}); repeat the run or remove its folder.")
     if not finished:
+        _check_digests(result, path)
         return None
     _check(result, REQUIRED, path, required=True)
     _check(result, OPTIONAL, path, required=False)
     _check(result.get("task", {}), NESTED, path, required=False)
+    _check_digests(result, path)
     return result
 
 
