@@ -1,6 +1,8 @@
 """Files of datasets in each format hold the episodes, as pyarrow, h5py, imageio and LeRobot read them."""
 
+import errno
 import json
+import os
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from gymnasium.spaces import Box
 
 from dora.datasets.episodes import Episode, Plan
 from dora.datasets.facts import Facts
+from dora.datasets.hdf5_files import ForgivingFile
 from dora.datasets.lerobot import write_lerobot
 from dora.datasets.minari import write_minari
 from dora.datasets.record import record_dataset
@@ -170,6 +173,32 @@ def test_minari_files_hold_the_episodes(tmp_path: Path):
                 ("infos/success", [False, *episode.successes]),
             ):  # fmt: skip
                 np.testing.assert_array_equal(group[name][()], value)
+
+
+@pytest.mark.parametrize("room", [0, 1000, 10**6])
+def test_a_disk_that_fills_up_is_told_and_hdf5_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int):
+    def write(descriptor: int, content: bytes, at: int) -> int:
+        if at >= room:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return pwrite(descriptor, content[: room - at], at)
+
+    pwrite = os.pwrite
+    monkeypatch.setattr(os, "pwrite", write)
+    values = np.random.default_rng(0).normal(size=(20, 50, 30))
+    with ForgivingFile(tmp_path / "file.h5") as below:
+        with h5py.File(below, "w") as file:
+            for k, value in enumerate(values):
+                file.create_group(f"episode_{k}", track_order=True).create_dataset("actions", data=value)
+            file.flush()
+            for k, value in enumerate(values):
+                np.testing.assert_array_equal(file[f"episode_{k}/actions"], value)  # pyright: ignore[reportArgumentType]
+        if room == 10**6:
+            below.check()
+            return
+        with h5py.File(below) as file:
+            assert len(file) == len(values)
+        with pytest.raises(OSError, match="No space left"):
+            below.check()
 
 
 @pytest.mark.skipif(not can_render(), reason="pictures need a Vulkan driver")

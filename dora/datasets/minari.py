@@ -3,7 +3,6 @@
 The format is that of Minari 0.5 (https://minari.farama.org), written with h5py.
 """
 
-import io
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -19,6 +18,7 @@ from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from dora import registration as registration
 from dora.datasets.episodes import Episode
 from dora.datasets.facts import Facts
+from dora.datasets.hdf5_files import ForgivingFile
 from dora.files import write_json
 
 VERSION = "0.5.4"
@@ -59,12 +59,14 @@ def write_minari(
         episodes: in the order in which they are stored.
     """
     (folder / DATA).parent.mkdir()
-    steps, count, content = 0, 0, io.BytesIO()  # of a file on a disk that fills up the library does not let go
-    with h5py.File(content, "w", track_order=True) as file:
-        for count, episode in enumerate(episodes, 1):
-            _write_episode(file.create_group(f"episode_{count - 1}"), count - 1, episode)
-            steps += len(episode)
-    (folder / DATA).write_bytes(content.getbuffer())
+    steps, count = 0, 0
+    with ForgivingFile(folder / DATA) as below:
+        with h5py.File(below, "w", track_order=True) as file:
+            for count, episode in enumerate(episodes, 1):
+                _write_episode(file.create_group(f"episode_{count - 1}"), count - 1, episode)
+                steps += len(episode)
+                below.check()
+        below.check()
     spec = EnvSpec(
         facts.env_id,
         entry_point=f"{__name__}:{recovered.__name__}",

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import h5py
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 from dora.arguments import LARGEST_SEED
 from dora.datasets.episodes import Episode, Plan, Source, make_batch, roll_out
 from dora.datasets.facts import Facts, facts_of
+from dora.datasets.hdf5_files import ForgivingFile
 from dora.datasets.lerobot import write_lerobot
 from dora.datasets.minari import write_minari
 from dora.datasets.tables import require_pyarrow
@@ -26,6 +28,8 @@ from dora.version import version_line
 
 FORMATS = ("lerobot", "minari", "maniskill")
 """Formats of datasets."""
+NAME = "demonstrations"
+"""Files of ManiSkill's format, before .h5 and .json."""
 OWN = "recording.json"
 """File of a dataset that says how it was made, and lists seed, length and success of its episodes."""
 
@@ -117,23 +121,25 @@ def record_dataset(
     check_possible(kind, plan, folder, pictures)
     summary, table = Summary(), list[dict[str, Any]]()
     with new_folder(folder) as place:
-        env = make_batch(source, min(plan.num_envs, plan.episodes), pictures)
-        if kind == "maniskill":
-            env = _recorder(env, place, source)
+        with contextlib.ExitStack() as stack:
+            recorder = below = None
+            env = make_batch(source, min(plan.num_envs, plan.episodes), pictures)
+            if kind == "maniskill":
+                recorder, below = stack.enter_context(_recorder(env, place, source))
+                env = recorder
+            stack.callback(env.close)
 
-        def episodes() -> Iterator[Episode]:
-            for row, episode in roll_out(env, source.act, plan, progress):
-                if isinstance(env, RecordEpisode):
-                    env.flush_trajectory(env_idxs_to_flush=[row])
-                summary.count(episode)
-                table.append({"seed": episode.seed, "steps": len(episode), "success": episode.success})
-                yield episode
+            def episodes() -> Iterator[Episode]:
+                for row, episode in roll_out(env, source.act, plan, progress):
+                    if recorder is not None and below is not None:
+                        recorder.flush_trajectory(env_idxs_to_flush=[row])
+                        below.check()
+                    summary.count(episode)
+                    table.append({"seed": episode.seed, "steps": len(episode), "success": episode.success})
+                    yield episode
 
-        try:
             options = json.loads(json.dumps(dict(source.options)))  # tuples become lists
             _write(kind, place, env, options, source, episodes())
-        finally:
-            env.close()
         made = {"env": source.env_id, "options": options, "policy": source.name, "description": source.description}
         write_json(place / OWN, {**made, "version": version_line(), "episodes": table})
     return summary
@@ -156,14 +162,21 @@ def _facts(env: gym.Env, source: Source) -> Facts:
     return facts_of(env)
 
 
-def _recorder(env: gym.Env, folder: Path, source: Source) -> RecordEpisode:
-    """A batch whose ended episodes can be written as ManiSkill's trajectories, with rewards and all states."""
-    return RecordEpisode(
+@contextlib.contextmanager
+def _recorder(env: gym.Env, folder: Path, source: Source) -> Iterator[tuple[RecordEpisode, ForgivingFile]]:
+    """A batch whose ended episodes can be written as ManiSkill's trajectories, with rewards and all states, and the
+    file into which they are written; it is closed at the end, whatever happens."""
+    recorder = RecordEpisode(
         env,  # pyright: ignore[reportArgumentType]
         str(folder),
-        trajectory_name="demonstrations",
+        trajectory_name=NAME,
         save_on_reset=False,
         save_video=False,
         source_type="motionplanning" if source.name == "scripted" else "rl",
         source_desc=source.description,
     )
+    recorder._h5_file.close()
+    with ForgivingFile(folder / f"{NAME}.h5") as below:
+        with h5py.File(below, "w") as recorder._h5_file:
+            yield recorder, below
+        below.check()

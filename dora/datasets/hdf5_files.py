@@ -1,0 +1,101 @@
+"""HDF5 files on a disk that may fill up.
+
+The HDF5 library does not let go of a file that it cannot write: h5py prints a page of lines, and the process ends in a
+segmentation fault. Here it never meets an error; who writes asks for it.
+"""
+
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+
+class ForgivingFile(io.RawIOBase):
+    """A new file that keeps in memory what the disk does not take.
+
+    Attributes:
+        failure: the first error of the disk, after which nothing more is written to it; None before.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.failure: OSError | None = None
+        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+        self._kept: list[tuple[int, bytes]] = []
+        self._at, self._size = 0, 0
+
+    def check(self) -> None:
+        """Raise the error of the disk, if there was one."""
+        if self.failure is not None:
+            raise self.failure
+
+    def readable(self) -> bool:
+        """Yes."""
+        return True
+
+    def writable(self) -> bool:
+        """Yes."""
+        return True
+
+    def seekable(self) -> bool:
+        """Yes."""
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Go to a place, as in any file."""
+        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._size}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        """The place [bytes]."""
+        return self._at
+
+    def write(self, data: Any) -> int:
+        """Write to the disk, or after its first error keep in memory."""
+        content = bytes(data)
+        try:
+            done = 0
+            while self.failure is None and done < len(content):
+                done += os.pwrite(self._descriptor, content[done:], self._at + done)
+        except OSError as error:
+            self.failure = error
+        if self.failure is not None:
+            self._kept.append((self._at, content))
+        self._at += len(content)
+        self._size = max(self._size, self._at)
+        return len(content)
+
+    def readinto(self, buffer: Any) -> int:
+        """Read what was written, wherever it is."""
+        view = memoryview(buffer).cast("B")
+        count = max(0, min(len(view), self._size - self._at))
+        found = bytearray(os.pread(self._descriptor, count, self._at).ljust(count, b"\0"))
+        for start, content in self._kept:
+            low, high = max(start, self._at), min(start + len(content), self._at + count)
+            if low < high:
+                found[low - self._at : high - self._at] = content[low - start : high - start]
+        view[:count] = found
+        self._at += count
+        return count
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the size [bytes], to the place by default."""
+        self._size = self._at if size is None else size
+        if self.failure is None:
+            try:
+                os.ftruncate(self._descriptor, self._size)
+            except OSError as error:
+                self.failure = error
+        return self._size
+
+    def close(self) -> None:
+        """Close it; what is kept in memory is gone."""
+        if not self.closed:
+            os.close(self._descriptor)
+        super().close()
