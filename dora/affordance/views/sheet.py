@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend as DrawnLegend
 from matplotlib.patches import Patch
 
+from dora.affordance.views.fonts import families
 from dora.files import write_bytes
 
 Legend = Mapping[str, tuple[int, int, int]]
@@ -49,6 +51,14 @@ def write_sheet(
     Raises:
         InputError: the file cannot be written.
     """
+    texts = [*(legend or ()), name, *(text for panel in panels for text in (panel.title, *panel.legend))]
+    content = io.BytesIO()
+    with rc_context({"font.family": families("".join(texts))}):
+        _drawn(panels, columns, legend, name).savefig(content, format="png")
+    write_bytes(Path(path), content.getvalue())
+
+
+def _drawn(panels: Sequence[Panel], columns: int, legend: Legend | None, name: str) -> Figure:
     rows = -(-len(panels) // columns)
     height, width, _ = panels[0].view.shape
     own = LEGEND if any(panel.legend for panel in panels) else 0
@@ -70,9 +80,7 @@ def write_sheet(
         _plain(figure.legend(
             handles=handles, loc="outside lower center", ncols=len(handles), fontsize=SIZE, frameon=False, title=name
         ))  # fmt: skip
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    write_bytes(Path(path), content.getvalue())
+    return figure
 
 
 def _patches(legend: Legend) -> list[Patch]:
