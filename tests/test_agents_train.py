@@ -76,6 +76,19 @@ def test_ppo_learns_and_leaves_a_complete_folder(tmp_path: Path):
     assert zero is not None
 
 
+def test_the_curve_has_the_success_of_the_latest_training_episodes(tmp_path: Path):
+    run(tmp_path / "run", dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=2048, eval_every=1024))
+    rows = read_progress(tmp_path / "run" / "progress.csv")
+    with (tmp_path / "run" / "curve.csv").open() as stream:
+        curve = list(csv.DictReader(stream))
+    for row in curve[1:] or curve:
+        before = rows["env_steps"] <= float(row["env_steps"])
+        ended = rows["episodes"][before]
+        assert 0 < ended.sum() <= trainer.RECENT
+        share = np.nansum(rows["success_rate"][before] * ended) / ended.sum()
+        assert float(row["training_success_rate"]) == pytest.approx(share, abs=1e-5)
+
+
 @pytest.mark.slow
 def test_sac_learns(tmp_path: Path):
     learner = SACConfig(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from fake_run import fake_words
-from test_sweep import fake, few, nothing, result, starts, states
+from fake_sweep import fake, few, nothing, result, starts, states
 
 import dora.sweeps.sweep
 from dora.agents.runs.run_folder import RunFolder

@@ -235,9 +235,11 @@ class RunFolder:
         if zero is not None:
             write_csv(self.path / "zero.csv", *zero.rows())
 
-    def write_result(self, result: dict[str, Any]) -> None:
-        """Write `result.json`, with digests of itself and of the tables in the folder."""
-        write_json(self.path / "result.json", with_digests(result, self.path))
+    def write_result(self, result: dict[str, Any]) -> dict[str, Any]:
+        """Write `result.json`, with digests of itself and of the tables in the folder; returns what it got."""
+        whole = with_digests(result, self.path)
+        write_json(self.path / "result.json", whole)
+        return whole
 
 
 def make_result(

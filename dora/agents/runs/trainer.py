@@ -167,8 +167,7 @@ class Trainer:
         )
         if evaluation is not None:
             self.folder.write_evaluation(evaluation, zero)
-        self.folder.write_result(result)
-        return result
+        return self.folder.write_result(result)
 
     def _rollouts(self, interrupt: Interrupt) -> Rollouts:
         config = self.config
