@@ -11,7 +11,7 @@ import pytest
 
 from dora.agents.reports import statistics
 from dora.agents.reports.comparison import Section, of_the_paper, sections
-from dora.agents.reports.failures import failure_kinds
+from dora.agents.reports.failures import failure_kinds, first_causes
 from dora.agents.reports.paper import BETTER, MEAN_GAIN, ONE_ARM, PAPER
 from dora.agents.reports.report import write_report
 from dora.agents.reports.run_results import find_runs
@@ -135,9 +135,38 @@ def test_failures_are_counted_once_by_the_first_reason():
     }  # fmt: skip
     kinds = failure_kinds([{name: np.array(values, float) for name, values in columns.items()}])
     assert kinds == pytest.approx({
-        "simulation not finite": 1 / 6, "no grasp within reach": 1 / 6, "overlap alone": 1 / 6, "before grasp": 1 / 6,
-        "lost again at the end": 1 / 6,
+        "the simulation was not finite": 1 / 6, "no grasp within reach": 1 / 6, "too much overlap": 1 / 6,
+        "grasp not done": 1 / 6, "lost again at the end": 1 / 6,
     })  # fmt: skip
+
+
+def test_with_the_longest_episode_a_loss_is_told_from_want_of_time():
+    done = {
+        "success": 0,
+        "raw_success": 0,
+        "nonfinite": 0,
+        "unreachable": 0,
+        "stage/reach": 1,
+        "stage/lift": 1,
+        "length": 100,
+    }
+    rows = [
+        {"success": 1, "raw_success": 1},
+        {"raw_success": 1},
+        {"raw_success": 1, "length": 50},
+        {"stage/lift": 0},
+        {"stage/lift": 0, "length": 50},
+        {"stage/reach": 0, "stage/lift": 0},
+        {"stage/reach": 0, "stage/lift": 0, "nonfinite": 1, "length": 9},
+        {"stage/reach": 0, "stage/lift": 0, "unreachable": 1, "length": 1},
+        {"length": 90},
+    ]
+    table = {name: np.array([(done | row)[name] for row in rows], float) for name in done}
+    assert first_causes(table, 100) == {
+        "the simulation was not finite": 1, "no grasp within reach": 1, "too much overlap": 2,
+        "object lost before lift": 1, "lift not done in time": 1, "reach not done in time": 1,
+        "lost again at the end": 1,
+    }  # fmt: skip
 
 
 def test_ours_stand_beside_the_papers_numbers(tmp_path: Path):

@@ -21,7 +21,7 @@ from dora.digests import sealed
 from dora.errors import InputError
 from dora.policies import bundle
 from dora.policies.bundle import PAGE, cards_table, check_agrees, chosen, is_bundled, make_card
-from dora.policies.card import Card, failure_causes
+from dora.policies.card import Card
 from dora.policies.policy import bundled_files, bundled_ids, load_policy
 from dora.tables import wilson
 from dora.tasks import find_task, task_ids
@@ -261,29 +261,6 @@ def episodes(*rows: dict[str, float]) -> Evaluation:
     usual = {"success": 1.0, "raw_success": 1.0, "whole": 1.0, "length": 100.0, "stage/reach": 1.0, "stage/lift": 1.0}
     table = torch.tensor([[(usual | row).get(name, 0.0) for name in COLUMNS.names] for row in rows])
     return Evaluation(COLUMNS, table)
-
-
-def test_failures_are_counted_by_the_first_cause() -> None:
-    lost = {"success": 0.0, "raw_success": 0.0}
-    found = failure_causes(
-        episodes(
-            {},
-            {"success": 0.0, "penetration_mm": 9.0},
-            {"success": 0.0, "penetration_mm": 4.0},
-            {**lost, "stage/lift": 0.0},
-            {**lost, "stage/lift": 0.0, "length": 50.0},
-            {**lost, "stage/reach": 0.0, "stage/lift": 0.0},
-            {**lost, "stage/reach": 0.0, "stage/lift": 0.0, "nonfinite": 1.0, "length": 9.0},
-            {**lost, "stage/reach": 0.0, "stage/lift": 0.0, "unreachable": 1.0, "length": 1.0},
-            {**lost, "length": 90.0},
-        ),
-        100,
-    )
-    assert found == {
-        "the simulation was not finite": 1, "no grasp within reach": 1, "too much overlap": 2,
-        "object lost before lift": 1, "lift not done in time": 1, "reach not done in time": 1,
-        "lost again at the end": 1,
-    }  # fmt: skip
 
 
 def test_a_result_that_the_policy_does_not_reach_is_refused() -> None:

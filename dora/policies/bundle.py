@@ -20,11 +20,12 @@ from dora.agents.checkpoint import Checkpoint, read_checkpoint
 from dora.agents.config import RunConfig
 from dora.agents.evaluation.evaluate import FINAL_SEED, Evaluation
 from dora.agents.evaluation.play import evaluate_checkpoint
+from dora.agents.reports.failures import first_causes
 from dora.agents.reports.run_results import DEFAULT_PRESET, Run, find_runs
 from dora.configs import plain
 from dora.errors import InputError, command
 from dora.files import make_folder, write_bytes
-from dora.policies.card import HEADINGS, SECONDS_PER_MINUTE, Card, failure_causes
+from dora.policies.card import HEADINGS, Card
 from dora.policies.policy import bundled_files, bundled_ids
 from dora.tables import markdown_table, wilson
 from dora.tasks import find_task, make_task, present_rules, task_ids
@@ -189,13 +190,14 @@ def make_card(choice: Choice, evaluation: Evaluation, run: str, commit: str | No
     task = find_task(config.env)
     limit = task_config(task.CONFIG, config.preset, result.get("task_config") or config.task).penetration_limit
     rate, episodes = result["success_rate"], result["eval_episodes"]
+    table = {name: evaluation.values(name).numpy() for name in evaluation.columns.names}
     shared: dict[str, Any] = {name: result[name] for name in ("env", "agent", "guidance", "seed", "stage_rates")}
     return Card(
         **shared,
         preset=config.preset,
         env_steps=progress["env_steps"],
         total_steps=config.total_steps,
-        minutes=result["wall_seconds"] / SECONDS_PER_MINUTE,
+        minutes=choice.run.minutes,
         chosen_among=choice.among,
         training_success=progress["best"][0],
         training_episodes=config.eval_episodes,
@@ -207,7 +209,7 @@ def make_card(choice: Choice, evaluation: Evaluation, run: str, commit: str | No
         overlap_p95_mm=result["penetration_p95_mm"],
         overlap_limit_mm=1000.0 * limit,
         counted_successes=round(evaluation.success_rate * len(evaluation.table)),
-        failures=failure_causes(evaluation, task.MAX_STEPS),
+        failures=first_causes(table, task.MAX_STEPS),
         run=run,
         run_commit=result.get("commit"),
         commit=commit,

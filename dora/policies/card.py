@@ -1,11 +1,8 @@
 """What is known of a bundled policy: where it comes from, how often it succeeds, and what it fails at."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from dora.agents.evaluation.evaluate import Evaluation
 from dora.configs import LARGEST, built, check_finite, check_ranges, plain
 from dora.digests import SEAL, is_whole, sealed
 from dora.errors import InputError
@@ -23,8 +20,6 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("training_success", "success_rate", "zero_success_rate"), (0, 1)),
 }  # fmt: skip
 """Lowest and highest value of figures."""
-SECONDS_PER_MINUTE = 60.0
-"""Seconds in a minute [s]."""
 HEADINGS = (
     "task", "agent", "preset", "steps", "seed", "success %", "scripted (zero correction) %", "overlap p95 mm",
     "what it fails at",
@@ -137,43 +132,3 @@ class Card:
             ["card made", f"{self.date} ({self.commit or 'unknown commit'})"],
         ]  # fmt: skip
         return text_table(["what", "value"], rows)
-
-
-def failure_causes(evaluation: Evaluation, max_steps: int) -> dict[str, int]:
-    """Failed episodes by the first cause that applies; a cause without episodes is left out.
-
-    Args:
-        evaluation: of the policy.
-        max_steps: of an episode that is not ended by a failure [control steps].
-    """
-    columns = evaluation.columns
-    stages = [name for name in columns.highest if name.startswith("stage/")]
-
-    def has(name: str) -> Any:
-        known = name in columns.names
-        return evaluation.values(name) > 0 if known else evaluation.values("success") < 0
-
-    early = evaluation.values("length") < max_steps
-    causes: dict[str, Any] = {
-        "the simulation was not finite": has("nonfinite"),
-        "no grasp within reach": has("unreachable"),
-        "too much overlap": has("raw_success"),
-        **_undone(stages, has, early),
-        "lost again at the end": ~has("success"),
-    }
-    left, counts = ~has("success"), {}
-    for cause, applies in causes.items():
-        found = int((left & applies).sum())
-        counts |= {cause: found} if found else {}
-        left &= ~applies
-    return counts
-
-
-def _undone(stages: Sequence[str], has: Any, early: Any) -> dict[str, Any]:
-    """Episodes in which each stage is the first that was not done: ended by the task's test of failure, or by time."""
-    found = {}
-    for stage in stages:
-        name = stage.removeprefix("stage/")
-        found[f"object lost before {name}"] = ~has(stage) & early
-        found[f"{name} not done in time"] = ~has(stage)
-    return found

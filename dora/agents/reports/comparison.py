@@ -36,8 +36,6 @@ FEWEST = 3
 """Seeds of every cell that a verdict on a claim needs [1]."""
 EXACT = 1e-9
 """Standard error below which a rate counts as exact [points]."""
-SECONDS = 60.0
-"""Seconds of a minute [s]."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +169,7 @@ def _minutes(cells: Mapping[Cell, list[Run]]) -> Section:
     rows = [
         [
             *cell,
-            f"{mean(run.result['wall_seconds'] for run in cells[cell]) / SECONDS:.1f}{shared_mark(cells[cell])}",
+            f"{mean(run.minutes for run in cells[cell]):.1f}{shared_mark(cells[cell])}",
             f"{printed.minutes:.1f}",
         ]
         for cell, printed in PAPER.items()
@@ -370,5 +368,6 @@ def _failures(runs: Sequence[Run]) -> Section:
         "Why episodes fail",
         head,
         rows,
-        "By the first stage that was not reached, or overlap alone. Runs without an eval.csv are left out.",
+        "Each failed episode by the first of its causes: overlap where all else succeeded, or the first stage "
+        "that was not done. Runs without an eval.csv are left out.",
     )

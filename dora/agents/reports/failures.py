@@ -1,38 +1,61 @@
-"""Why episodes of an evaluation failed, from their tables."""
+"""Why episodes of an evaluation failed, from their table."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+
+STAGE = "stage/"
+"""Beginning of the columns that say whether a stage was done."""
+CHECKS = {
+    "the simulation was not finite": "nonfinite", "no grasp within reach": "unreachable",
+    "too much overlap": "raw_success",
+}  # fmt: skip
+"""Causes that come before those of the stages, and the columns that are above 0 where they apply."""
+Table: TypeAlias = Mapping[str, Float[np.ndarray, " e"]]
+"""Columns of an eval.csv by name, a value for each episode."""
 
 
-def failure_kinds(tables: Sequence[Mapping[str, Float[np.ndarray, " _"]]]) -> dict[str, float]:
+def first_causes(table: Table, max_steps: int | None = None) -> dict[str, int]:
+    """Failed episodes by the first cause that applies; a cause without episodes is left out.
+
+    Args:
+        table: its columns; what it lacks is no cause.
+        max_steps: of an episode that is not ended by a failure [control steps]; None does not tell an object that was
+            lost from a stage that took too long.
+    """
+    left, counts = table["success"] == 0, dict[str, int]()
+    for cause, applies in _causes(table, max_steps):
+        found = int((left & applies).sum())
+        counts |= {cause: found} if found else {}
+        left &= ~applies
+    return counts
+
+
+def _causes(table: Table, max_steps: int | None) -> Iterator[tuple[str, Bool[np.ndarray, " e"]]]:
+    """Causes in the order in which they count, and the episodes to which they apply."""
+    for cause, name in CHECKS.items():
+        if name in table:
+            yield cause, table[name] > 0
+    for column in table:
+        if column.startswith(STAGE):
+            stage, undone = column.removeprefix(STAGE), table[column] == 0
+            if max_steps is not None:
+                yield f"object lost before {stage}", undone & (table["length"] < max_steps)
+            yield f"{stage} not done" + (" in time" if max_steps else ""), undone
+    yield "lost again at the end", np.full(len(table["success"]), True)
+
+
+def failure_kinds(tables: Sequence[Table]) -> dict[str, float]:
     """Share of episodes that failed for each reason, the most frequent first.
 
     Args:
-        tables: columns of the eval.csv of each run.
+        tables: of each run.
     """
     counts: dict[str, int] = {}
-    total = 0
     for table in tables:
-        left = table["success"] == 0
-        total += len(left)
-        checks = [
-            ("simulation not finite", table.get("nonfinite")),
-            ("no grasp within reach", table.get("unreachable")),
-            ("overlap alone", table.get("raw_success")),
-        ]
-        for kind, column in checks:
-            if column is not None and len(column) == len(left):
-                left = _count(counts, kind, left, column > 0)
-        for name, column in table.items():
-            if name.startswith("stage/"):
-                left = _count(counts, f"before {name.removeprefix('stage/')}", left, column == 0)
-        _count(counts, "lost again at the end", left, left)
-    return {kind: count / total for kind, count in sorted(counts.items(), key=lambda item: -item[1]) if count}
-
-
-def _count(counts: dict[str, int], kind: str, left: np.ndarray, applies: np.ndarray) -> np.ndarray:
-    """Adds the episodes to which a reason applies; the mask of those that are left."""
-    counts[kind] = counts.get(kind, 0) + int((left & applies).sum())
-    return left & ~applies
+        for cause, count in first_causes(table).items():
+            counts[cause] = counts.get(cause, 0) + count
+    total = sum(len(table["success"]) for table in tables)
+    return {kind: count / total for kind, count in sorted(counts.items(), key=lambda item: -item[1])}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from dora.agents.reports.run_results import Group, Run, grouped, zero_episodes, zero_shares
+from dora.agents.reports.run_results import SECONDS_PER_MINUTE, Group, Run, grouped, zero_episodes, zero_shares
 
 COLOURS = {
     ("PPO", "affordance"): "#c0392b",
@@ -19,8 +19,6 @@ COLOURS = {
 """Line colour of each learner with and without guidance."""
 OTHERS = ("#148f77", "#b9770e", "#7d3c98", "#566573", "#d98880", "#2e86c1")
 """Line colours of all else, in this order."""
-SECONDS_PER_MINUTE = 60.0
-"""Seconds per minute [s]."""
 EPOCHS = 10_000
 """Epochs of the paper's trainings [1]: one of its epochs is this share of a budget."""
 SIGMA = 200

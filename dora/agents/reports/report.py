@@ -7,7 +7,7 @@ from statistics import mean, stdev
 from urllib.parse import quote
 
 from dora.agents.reports.comparison import OVERLAP, Section, sections
-from dora.agents.reports.figures import SECONDS_PER_MINUTE, draw_curves, draw_overlap
+from dora.agents.reports.figures import draw_curves, draw_overlap
 from dora.agents.reports.run_results import (
     ALONE,
     DEFAULT_PRESET,
@@ -108,7 +108,7 @@ def table_rows(runs: Sequence[Run]) -> list[list[str]]:
             pooled(zero_shares(members)),
             _spread([m.result["penetration_p95_mm"] for m in members]),
             f"{thousands}k",
-            _spread([m.result["wall_seconds"] / SECONDS_PER_MINUTE for m in members]) + shared_mark(members),
+            _spread([m.minutes for m in members]) + shared_mark(members),
         ])  # fmt: skip
     return rows
 

@@ -16,6 +16,8 @@ from dora.agents.runs.stored_results import check_agreement, read_curve, read_ep
 from dora.configs import flat
 from dora.errors import InputError
 
+SECONDS_PER_MINUTE = 60.0
+"""Seconds in a minute [s]."""
 DEFAULT_PRESET = "standard"
 """Preset of a run of a Dora task that names none."""
 
@@ -61,6 +63,11 @@ class Run:
         agent += ", evaluated again" if result.get("checkpoint") else ""
         guidance += EARLIER if self.outdated else ""
         return result["env"], task.get("preset", DEFAULT_PRESET), agent, guidance, round(self.budget / 1000)
+
+    @property
+    def minutes(self) -> float:
+        """Wall time of the run [min]."""
+        return self.result["wall_seconds"] / SECONDS_PER_MINUTE
 
     @property
     def budget(self) -> int:
