@@ -1,14 +1,13 @@
 """Sections of a report that set runs beside each other and beside the paper: from their files alone."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from statistics import mean
 
 import numpy as np
-from jaxtyping import Float
 
+from dora.agents.reports.claims import above_the_best, claims
 from dora.agents.reports.failures import failure_kinds
-from dora.agents.reports.paper import BETTER, DIFFERENCES, JUG_GAIN, MEAN_GAIN, ONE_ARM, PAPER, Cell
+from dora.agents.reports.paper import DIFFERENCES, ONE_ARM, PAPER, Cell
 from dora.agents.reports.run_results import (
     DEFAULT_PRESET,
     EARLIER,
@@ -18,41 +17,16 @@ from dora.agents.reports.run_results import (
     grouped,
     in_words,
     shared_mark,
-    success_shares,
     zero_episodes,
     zero_shares,
 )
+from dora.agents.reports.section import NONE, Section, outcomes_of, rate_of, success_of
 from dora.agents.reports.statistics import Interval, aggregates, crossed_interval, mean_of_curve, paired_difference
 
-NONE = "-"
-"""Cell of a table for which there is no run."""
 OVERLAP = "penetration_mm"
 """Column of an episode's largest overlap [mm]."""
 SWITCHES = ("optimised",)
 """Switches of tasks that choose between variants of them."""
-NORMAL = 1.96
-"""Half width of a normal distribution's 95 % interval, in standard deviations [1]."""
-FEWEST = 3
-"""Seeds of every cell that a verdict on a claim needs [1]."""
-EXACT = 1e-9
-"""Standard error below which a rate counts as exact [points]."""
-
-
-@dataclass(frozen=True)
-class Section:
-    """A table of a report.
-
-    Attributes:
-        title: above it.
-        head: names of its columns.
-        rows: cells.
-        note: below it.
-    """
-
-    title: str
-    head: tuple[str, ...]
-    rows: list[list[str]]
-    note: str = ""
 
 
 def sections(runs: Sequence[Run]) -> list[Section]:
@@ -60,7 +34,7 @@ def sections(runs: Sequence[Run]) -> list[Section]:
     cells = of_the_paper(runs)
     made = [_differences(runs), _stages(runs), _overlap(runs), _failures(runs), _gains(cells)]
     if cells:
-        made += [_success(cells), _minutes(cells), _claims(cells), _setup(), *_aggregated(cells)]
+        made += [_success(cells), _minutes(cells), claims(cells), above_the_best(cells), _setup(), *_aggregated(cells)]
     return [section for section in made if section.rows]
 
 
@@ -102,39 +76,11 @@ def variant(runs: Sequence[Run]) -> str:
     steps = f"{runs[0].budget / 1000:.0f}k"
     words = runs[0].result.get("task_config") or {}
     switches = [
-        in_words(name, str(value)) for name, value in words.items() if isinstance(value, bool) and name in SWITCHES
+        in_words(name, str(value))
+        for name, value in words.items()
+        if isinstance(value, bool) and name in SWITCHES and runs[0].result["guidance"] != "none"
     ]
     return ", ".join([steps, *switches]) + (EARLIER if runs[0].outdated else "")
-
-
-def success_of(runs: Sequence[Run]) -> Float[np.ndarray, "seeds starts"] | None:
-    """Outcomes of all seeds on the starts that all were evaluated on; None if their episodes are not there."""
-    return _outcomes([run.episodes for run in runs], [run.result.get("first_seed") for run in runs])
-
-
-def _outcomes(
-    tables: Sequence[Mapping[str, Float[np.ndarray, " _"]]], first: Sequence[int | None]
-) -> Float[np.ndarray, "seeds starts"] | None:
-    columns = [table.get("success") for table in tables]
-    known = [column for column in columns if column is not None]
-    alike = len(known) == len(columns) and len({len(c) for c in known}) == 1 and len(set(first)) == 1
-    return np.stack(known) if known and alike else None
-
-
-def _rate(runs: Sequence[Run]) -> float:
-    """Success over the episodes of all runs [%]; the mean of their rates where it is not known how many there were."""
-    shares = success_shares(runs)
-    trials = sum(n for _, n in shares)
-    return 100 * (sum(s * n for s, n in shares) / trials if all(n for _, n in shares) else mean(s for s, _ in shares))
-
-
-def _error(runs: Sequence[Run]) -> float:
-    """Standard error of `_rate` over seeds and starts [%]; infinite where the episodes are not there."""
-    outcomes = success_of(runs)
-    if outcomes is None:
-        return float("inf")
-    low, high = crossed_interval(outcomes)
-    return 100 * (high - low) / (2 * NORMAL)
 
 
 def with_interval(value: float, interval: Interval, sign: bool = False) -> str:
@@ -151,13 +97,24 @@ def _success(cells: Mapping[Cell, list[Run]]) -> Section:
         if runs:
             outcomes = success_of(runs)
             ours = (
-                f"{_rate(runs):.1f}" if outcomes is None else with_interval(outcomes.mean(), crossed_interval(outcomes))
+                f"{rate_of(runs):.1f}"
+                if outcomes is None
+                else with_interval(outcomes.mean(), crossed_interval(outcomes))
             )
             known = [run.result.get("raw_success_rate") for run in runs]
             raw = NONE if None in known else f"{100 * mean(rate for rate in known if rate is not None):.1f}"
         about = [str(len(runs)), variant(runs) if runs else NONE]
         rows.append([*cell, *about, ours, raw, f"{printed.success:.1f} ± {printed.deviation:.1f}"])
-    head = ("task", "learner", "guidance", "seeds", "of", "success %", "overlap not counted %", "paper %")
+    head = (
+        "task",
+        "learner",
+        "guidance",
+        "seeds",
+        "steps, candidates",
+        "success %",
+        "overlap not counted %",
+        "paper %",
+    )
     note = (
         "In brackets the bootstrap interval over seeds and starts, where the episodes of all runs are there. "
         "With three seeds that differ it is too narrow: it covers the true mean in about 85 to 90 of 100 cases."
@@ -197,11 +154,14 @@ def _gains(cells: Mapping[Cell, list[Run]]) -> Section:
         areas = [[a for r in runs if (a := mean_of_curve(r.curve, r.budget)) is not None] for runs in (guided, plain)]
         area = f"{100 * (mean(areas[0]) - mean(areas[1])):+.1f}" if all(areas) else NONE
         printed = PAPER[env, agent, "affordance"].success - PAPER[env, agent, "none"].success
-        final = _rate(guided) - _rate(plain)
+        final = rate_of(guided) - rate_of(plain)
         rows.append([env, agent, f"{final:+.1f}", f"{printed:+.1f}", area, *(_steps(runs) for runs in (guided, plain))])
     head = ("task", "learner", "gain", "gain in the paper", "gain of the mean over training",
             "steps to 80 %, guided", "steps to 80 %, unguided")  # fmt: skip
-    note = "Guidance `affordance` less `none`, in points of success."
+    note = (
+        "Guidance `affordance` less `none`, in points of success. The mean over training is the area under the "
+        "evaluations, of which the first stands for the time before it and the last for the rest of the budget."
+    )
     return Section("What guidance gains", head, rows, note)
 
 
@@ -210,73 +170,6 @@ def _steps(runs: Sequence[Run]) -> str:
     known = [run.result.get("steps_to_80") for run in runs]
     reached = [steps for steps in known if steps is not None]
     return f"{mean(reached) / 1000:.0f}k ({len(reached)} of {len(known)})" if reached else f"never (0 of {len(known)})"
-
-
-def _learners(env: str) -> list[Cell]:
-    """The cells of the two learners of a task with guidance."""
-    return [(env, agent, "affordance") for agent in ("PPO", "SAC")]
-
-
-def _ahead(env: str, rates: Mapping[Cell, float]) -> float:
-    """By how much the learner that is better on a task in the paper is ahead here [points]."""
-    ppo, sac = (rates.get(cell, 0.0) for cell in _learners(env))
-    return ppo - sac if BETTER[env] == "PPO" else sac - ppo
-
-
-def _claims(cells: Mapping[Cell, list[Run]]) -> Section:
-    rates = {cell: _rate(runs) for cell, runs in cells.items()}
-
-    def row(claim: str, paper: str, needed: Sequence[Cell], ours: str, margin: float, error: float) -> list[str]:
-        """A claim that holds if `margin` is above zero, by more than its standard error times 1.96; undecided where
-        the error is not known."""
-        missing = [
-            f"{env} {agent} {guidance}" for env, agent, guidance in needed if (env, agent, guidance) not in cells
-        ]
-        if missing:
-            return [claim, paper, NONE, f"runs are missing: {', '.join(missing)}"]
-        fewest = min(len({run.result.get("seed") for run in cells[cell]}) for cell in needed)
-        if fewest < FEWEST:
-            return [claim, paper, ours, f"too few runs: {fewest} of {FEWEST} seeds"]
-        sure = np.isfinite(error) and abs(margin) > NORMAL * error
-        return [claim, paper, ours, ("reproduced" if margin >= 0 else "not reproduced") if sure else "undecided"]
-
-    errors = {cell: _error(runs) for cell, runs in cells.items()}
-
-    def spread(some: Sequence[Cell]) -> float:
-        """Standard error of a sum over cells."""
-        return sum(errors.get(cell, 0.0) ** 2 for cell in some) ** 0.5
-
-    one_arm = [cell for cell in PAPER if cell[0] in ONE_ARM]
-    guided = [cell for cell in one_arm if cell[2] == "affordance"]
-    gains = [rates.get(cell, 0.0) - rates.get((*cell[:2], "none"), 0.0) for cell in guided]
-    jug = ("DoraJug-v1", "PPO", "affordance"), ("DoraJug-v1", "PPO", "none")
-    jug_gain = rates.get(jug[0], 0.0) - rates.get(jug[1], 0.0)
-    ahead = {env: _ahead(env, rates) for env in BETTER}
-    errors_ahead = {env: max(spread(_learners(env)), EXACT) for env in BETTER}
-    weakest = min(ahead, key=lambda env: ahead[env] / errors_ahead[env])
-    mean_gain, learners = mean(gains), ", ".join(f"{env}: {BETTER[env]} {d:+.1f}" for env, d in ahead.items())
-    average = "affordance gains on average over tasks 1 to 3 and both learners"
-    rows = [
-        row(average, f"{MEAN_GAIN:+.1f}", one_arm, f"{mean_gain:+.1f}", mean_gain - MEAN_GAIN,
-            spread(one_arm) / len(guided)),
-        row("affordance gains on the jug with PPO", f"{JUG_GAIN:+.1f}", jug, f"{jug_gain:+.1f}", jug_gain - JUG_GAIN,
-            spread(jug)),
-        row("PPO is better on cube and jug, SAC on the hammer", "yes", guided, learners, ahead[weakest],
-            errors_ahead[weakest]),
-    ]  # fmt: skip
-    for env in dict.fromkeys(env for env, *_ in PAPER):
-        both = [cell for cell in PAPER if cell[0] == env and cell[2] == "affordance"]
-        bar = max(PAPER[cell].success for cell in both)
-        lowest = min(both, key=lambda cell: rates.get(cell, 0.0))
-        worst = rates.get(lowest, 0.0)
-        claim = f"both guided learners are above the paper's best on {env}"
-        rows.append(row(claim, f"{bar:.1f}", both, f"{worst:.1f}", worst - bar, errors.get(lowest, 0.0)))
-    note = (
-        f"A verdict needs {FEWEST} seeds of every cell; it is undecided where the bar is within the 95 % interval over "
-        "seeds and starts. The last four lines are no claims of the paper: they say whether both learners here are "
-        "above its best."
-    )
-    return Section("The paper's claims", ("claim", "paper", "here", "verdict"), rows, note)
 
 
 def _setup() -> Section:
@@ -307,12 +200,12 @@ def _aggregated(cells: Mapping[Cell, list[Run]]) -> list[Section]:
 def _differences(runs: Sequence[Run]) -> Section:
     rows = []
     for (env, preset, agent, guidance, _), members in grouped(runs).items():
-        zero = _outcomes(zero_episodes(members), [run.result.get("first_seed") for run in members])
+        zero = outcomes_of(zero_episodes(members), [run.result.get("first_seed") for run in members])
         ours = success_of(members)
         if zero is not None and ours is not None and zero.shape[1] == ours.shape[1]:
             text = with_interval(*paired_difference(ours, zero), sign=True)
         elif zero_shares(members):
-            text = f"{_rate(members) - 100 * mean(share for share, _ in zero_shares(members)):+.1f}"
+            text = f"{rate_of(members) - 100 * mean(share for share, _ in zero_shares(members)):+.1f}"
         else:
             continue
         rows.append([env, preset, agent, guidance, str(len(members)), text])
