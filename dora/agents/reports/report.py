@@ -68,7 +68,7 @@ NOTE = (
     "In brackets Wilson's 95 % interval over the evaluation episodes of all seeds, which counts neither how much seeds "
     "differ nor that they have the same starts. Episodes of zero correction on the same starts are the same and count "
     f"once. Other columns: mean and deviation over seeds. Minutes with{SHARED}: other programs kept more than {ALONE} "
-    f"cores busy meanwhile; with{UNKNOWN}: that was not measured. Guidance with '{EARLIER.strip(', ')}': what counts as "
+    f"cores busy meanwhile; with{UNKNOWN}: that was not measured. Guidance '{EARLIER.strip(', ')}': what counts as "
     "a success has changed since (definition in the task's numbers), and the figures are by the earlier rules."
 )
 """What stands below the table."""
