@@ -69,7 +69,7 @@ def _feed(digest: Any, value: Any) -> None:
         _head(digest, "bytes", len(value))
         digest.update(value)
     elif value is None or isinstance(value, bool | int | float | str):
-        text = f"{type(value).__name__} {value!r}".encode()
+        text = f"{type(value).__name__} {value!a}".encode()  # `repr` differs between versions of Unicode
         _head(digest, "scalar", len(text))
         digest.update(text)
     else:

@@ -71,6 +71,10 @@ def script() -> ModuleType:
         ("--eval-only --zero-correction --env DoraCube-v1 --seed 200000", "seeds from 0 to 199999"),
         ("--eval-only --zero-correction --env DoraCube-v1 --seed 1 --episodes 10001", "has to be from 1 to 10000"),
         ("--eval-only --checkpoint /nowhere.safetensors", "no checkpoint"),
+        (
+            f"--eval-only --checkpoint {COMMITTED[0]} --episodes 10001",
+            "--episodes is 10001 and has to be from 1 to 10000",
+        ),
         ("--eval-only --zero-correction --env DoraCube-v1 --learner.gamma 0.5", "--learner.* has no effect"),
         ("--eval-only --zero-correction --env DoraCube-v1 --total-steps 5", "--total-steps has no effect"),
         ("--eval-only --zero-correction --env DoraCube-v1 --num-envs 5", "--num-envs has no effect"),

@@ -224,3 +224,33 @@ def test_lerobot_reads_it(tmp_path: Path):
     assert (len(dataset), dataset.num_episodes) == (11, 3)
     actions = np.stack([dataset[k]["action"].numpy() for k in range(11)])
     np.testing.assert_array_equal(actions, np.concatenate([episode.actions for episode in episodes]))
+
+
+def test_an_interruption_waits_until_hdf5_has_closed_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def write(descriptor: int, content: bytes, at: int) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "pwrite", write)
+    with ForgivingFile(tmp_path / "file.h5") as below:
+        with h5py.File(below, "w") as file:
+            file.create_dataset("values", data=np.zeros(1000))
+        with pytest.raises(KeyboardInterrupt):
+            below.check()
+
+
+def test_a_file_that_cannot_be_made_or_closed_leaves_no_descriptor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(OSError, match="No such file"):
+        ForgivingFile(tmp_path / "nowhere" / "file.h5")
+    below, closed = ForgivingFile(tmp_path / "file.h5"), list[int]()
+
+    def close(descriptor: int) -> None:
+        closed.append(descriptor)
+        raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "close", close)
+        with pytest.raises(OSError, match="quota"):
+            below.close()
+        below.close()
+    assert len(closed) == 1
+    os.close(closed[0])

@@ -85,3 +85,7 @@ def test_bundled_tables_of_feasibility_are_found(env_id: str):
 @pytest.mark.parametrize("path", POLICIES, ids=lambda p: p.parent.name)
 def test_committed_policies_load(path: Path):
     assert read_checkpoint(path).tensors
+
+
+def test_texts_have_the_same_digest_whatever_unicode_a_version_of_python_knows():
+    assert digest_of("runs/\U0001fae8") == "0ac60ac89469a266e4d65265b72fc7f4a839117291d477865c9a1123f1a1dee1"

@@ -251,6 +251,14 @@ def test_a_run_that_was_only_evaluated_again_comes_last_but_for_one_of_earlier_r
     assert last.run is again
 
 
+def test_a_result_of_a_version_without_what_a_card_needs_is_passed_over() -> None:
+    runs = [
+        dataclasses.replace(run, result={k: v for k, v in run.result.items() if k != "eval_episodes"})
+        for run in find_runs(RESULTS)
+    ]
+    assert chosen(runs, "DoraCube-v1") is None
+
+
 COLUMNS = EpisodeColumns.of(
     ("stage/reach", "stage/lift", "penetration_mm", "raw_success", "success_at_end", "nonfinite", "unreachable")
 )
@@ -285,6 +293,10 @@ def test_a_further_run_that_is_no_better_only_changes_how_many_there_were(
     assert is_bundled(more)
     bundle.count_runs(more)
     assert Card.read(copies[1]) == dataclasses.replace(Card.read(files[1]), chosen_among=more.among)
+    whole = copies[1].read_text()
+    copies[1].write_text(whole.replace('"success_rate": 0', '"success_rate": 1'))
+    assert not is_bundled(more), "a damaged card is made anew"
+    copies[1].write_text(whole)
     copies[0].write_bytes(bundled_files("DoraJug-v1")[0].read_bytes())
     assert not is_bundled(more), "another policy is no longer bundled"
 

@@ -8,7 +8,7 @@ from probes import write_result
 
 from dora.agents.reports.run_results import find_runs
 from dora.agents.runs.run_folder import RunFolder
-from dora.agents.runs.stored_results import OF_TABLES, TABLES, read_result
+from dora.agents.runs.stored_results import MOST_TABLE, OF_TABLES, TABLES, read_result
 from dora.digests import SEAL
 from dora.errors import InputError
 
@@ -72,3 +72,39 @@ def test_every_stored_result_has_its_digests(project_root: Path):
     for path in found:
         assert SEAL in json.loads(path.read_text()), path
         assert read_result(path), path
+
+
+def test_a_table_that_the_result_does_not_know_is_refused(folder: Path):
+    content = (folder / "zero.csv").read_bytes()
+    (folder / "zero.csv").unlink()
+    RunFolder(folder).write_result(json.loads((folder / "result.json").read_text()))
+    (folder / "zero.csv").write_bytes(content)
+    with pytest.raises(InputError, match=r"zero.csv is damaged \(result.json does not know it\)"):
+        find_runs(folder)
+
+
+def test_a_run_whose_table_is_too_large_for_a_report_ends_and_goes_on(folder: Path):
+    line = (folder / "progress.csv").read_bytes().splitlines(keepends=True)[-1]
+    with (folder / "progress.csv").open("ab") as file:
+        file.write(line * (MOST_TABLE // len(line)))
+    run = RunFolder(folder)
+    result = run.write_result(json.loads((folder / "result.json").read_text()))
+    assert read_result(folder / "result.json") == result
+    run.mark_unfinished()
+    run.write_result(result)
+    with pytest.raises(InputError, match="may have at most"):
+        find_runs(folder)
+
+
+def test_the_path_of_a_checkpoint_may_be_long(folder: Path):
+    run = RunFolder(folder)
+    run.write_result(json.loads((folder / "result.json").read_text()) | {"checkpoint": "/".join(["d" * 60] * 20)})
+    assert read_result(folder / "result.json")
+
+
+def test_episodes_are_numbers(folder: Path):
+    table, result = folder / "eval.csv", folder / "result.json"
+    table.write_text(table.read_text().replace("0.07", "nan"))
+    RunFolder(folder).write_result(json.loads(result.read_text()))
+    with pytest.raises(InputError, match=r"eval.csv is damaged \(penetration_mm is no number somewhere\)"):
+        find_runs(folder)

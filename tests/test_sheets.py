@@ -1,5 +1,6 @@
 """Sheets of pictures show names in any script."""
 
+import dataclasses
 import warnings
 from pathlib import Path
 
@@ -32,3 +33,19 @@ def test_installed_fonts_are_used_for_what_the_own_one_lacks():
         font_manager.findfont(font_manager.FontProperties(family=lacking[-1:]))
     ).get_charmap()
     assert {ord("把"), ord("手")} <= set(letters)
+
+
+def test_a_name_that_is_not_in_utf_8_is_drawn_as_far_as_it_goes(tmp_path: Path):
+    write_sheet([Panel(np.zeros((90, 90, 3), np.uint8), "caf\udce9")], tmp_path / "sheet.png", 1, name="\udce9\ue000")
+
+
+@pytest.mark.parametrize("content", [None, b"no font"])
+def test_a_font_that_is_gone_or_damaged_is_passed_over(
+    content: bytes | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    path = tmp_path / "font.ttf"
+    if content is not None:
+        path.write_bytes(content)
+    gone = dataclasses.replace(font_manager.fontManager.ttflist[0], fname=str(path), name="Aaa Gone")
+    monkeypatch.setattr(font_manager.fontManager, "ttflist", [gone, *font_manager.fontManager.ttflist])
+    assert "Aaa Gone" not in families("把手")

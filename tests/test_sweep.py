@@ -169,6 +169,7 @@ def test_the_dry_run_shows_every_run_and_trains_nothing(
         ("--known nowhere", "--known nowhere is not a folder"),
         ("--env DoraDoor-v1", "--env 'DoraDoor-v1' is not in the sweep paper"),
         ("--total-steps 0", "--total-steps is 0"),
+        (f"--jobs {10**400}", "--jobs is larger than 4096"),
     ],
 )
 def test_what_makes_no_sense_is_refused(

@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,8 +13,9 @@ from fake_sweep import fake, few, nothing, result, starts, states
 import dora.sweeps.sweep
 from dora.agents.runs.run_folder import RunFolder
 from dora.configs import plain
+from dora.errors import InputError
 from dora.sweeps import ray_cluster
-from dora.sweeps.launching import NOT_THE_RUN, LocalLauncher, prepare
+from dora.sweeps.launching import NOT_THE_RUN, LocalLauncher, prepare, steps_of
 from dora.sweeps.plan import rows_of
 from dora.sweeps.sweep import State, Sweep
 
@@ -62,6 +64,40 @@ def test_an_evaluation_of_zero_correction_is_no_trained_run(tmp_path: Path):
     (row,) = short_rows(1000)
     result(row, tmp_path / "known" / "zero", agent="zero", env_steps=0, checkpoint=None)
     assert states(Sweep([row], tmp_path / "out", [tmp_path / "known"])) == [State.WAITING]
+
+
+@pytest.mark.parametrize("status", [0, 1])
+def test_a_result_that_a_run_leaves_damaged_fails_that_run_alone(tmp_path: Path, status: int):
+    first, second = few(2)
+
+    def command(folder: Path, zero: bool) -> list[str]:
+        words = fake_words(folder, "well")
+        torn = (
+            f"import pathlib, sys; pathlib.Path({str(folder / 'result.json')!r}).write_text('{{'); sys.exit({status})"
+        )
+        return [sys.executable, "-c", torn] if folder.name == Path(first.name).name else words
+
+    sweep = Sweep([first, second], tmp_path)
+    sweep.run(LocalLauncher(command), nothing, nothing)
+    assert states(sweep) == [State.FAILED, State.DONE]
+    assert "is damaged" in sweep.entries[0].complaint
+
+
+def test_files_that_arrive_over_an_older_result_take_its_place_at_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """An interruption leaves an unfinished run, no result beside tables that are not its own."""
+    (tmp_path / "result.json").write_text("{}")
+    (tmp_path / "eval.csv").mkdir()
+    with pytest.raises(InputError):
+        ray_cluster.receive(tmp_path, {"curve.csv": b"new", "eval.csv": b"new", "result.json": b"new"})
+    assert not (tmp_path / "result.json").exists()
+
+
+def test_steps_are_read_from_files_with_sensible_numbers_alone(tmp_path: Path):
+    os.mkfifo(tmp_path / "progress.csv")
+    assert steps_of(tmp_path) == 0
+    (tmp_path / "progress.csv").unlink()
+    (tmp_path / "progress.csv").write_text(f"env_steps,x\n120,1\n-5,2\n{'9' * 400},3\n")
+    assert steps_of(tmp_path) == 120
 
 
 def test_a_run_that_ends_as_another_one_has_failed(tmp_path: Path):

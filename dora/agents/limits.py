@@ -116,6 +116,17 @@ def check(config: RunConfig, stored: bool = False) -> None:
         )
 
 
+def check_episodes(count: int) -> None:
+    """Refuse a number of evaluation episodes that new evaluations may not have.
+
+    Raises:
+        InputError: it is out of range.
+    """
+    low, high = RUN["final_episodes"]
+    if not low <= count <= high:
+        raise InputError(f"--episodes is {count} and has to be from {low} to {high}.")
+
+
 def check_checkpoint(size: int) -> None:
     """Refuse networks whose checkpoints would be too large to be read again.
 

@@ -28,7 +28,7 @@ from dora.agents.checkpoint import read_checkpoint
 from dora.agents.config import LEARNER_CONFIGS, Agent, Numbers, RunConfig, Settings
 from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed, outcome
 from dora.agents.evaluation.play import checkpoint_path, evaluate_checkpoint, evaluate_zero, load_policy, record
-from dora.agents.limits import check
+from dora.agents.limits import check, check_episodes
 from dora.agents.runs.interrupt import STATUS, ending_at_once
 from dora.agents.runs.logging import add_film
 from dora.agents.runs.recommended import learners_of, recommended
@@ -124,6 +124,8 @@ def parse(words: Sequence[str]) -> Args[dict[str, Any], Any, str]:
     guidance_in_force(config.guidance, config.guidance_parts)
     if not args.eval_only:
         return replace(args, run=config)
+    if config.final_episodes != base.final_episodes:
+        check_episodes(config.final_episodes)
     refuse_settings_of_training(base, config)
     if args.collector != default.collector:
         raise InputError("--collector has no effect on an evaluation: leave it out.")

@@ -26,6 +26,8 @@ from dora.sweeps.launching import Launcher, LocalLauncher
 from dora.sweeps.plan import rows_of
 from dora.sweeps.sweep import State, Sweep
 
+MOST_JOBS = 4096
+"""Most runs at the same time [1]."""
 FAILED = 1
 """Exit status when runs have failed."""
 
@@ -112,6 +114,8 @@ def _check(args: Args) -> None:
         smallest = least.get(option, 1)
         if value is not None and value < smallest:
             raise InputError(f"{option} is {value}, but has to be at least {smallest}.")
+    if args.jobs > MOST_JOBS:
+        raise InputError(f"--jobs is larger than {MOST_JOBS}: give as many as there are cores for.")
     if args.launcher == "local" and args.address is not None:
         raise InputError("--address is that of a Ray cluster: add --launcher ray, or leave it out.")
     for seed in args.seeds:

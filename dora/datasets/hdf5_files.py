@@ -14,7 +14,8 @@ class ForgivingFile(io.RawIOBase):
     """A new file that keeps in memory what the disk does not take.
 
     Attributes:
-        failure: the first error of the disk, after which nothing more is written to it; None before.
+        failure: the first error of the disk, or an interruption, after which nothing more is written to it; None
+            before.
 
     Args:
         path: of the file.
@@ -24,14 +25,14 @@ class ForgivingFile(io.RawIOBase):
     """
 
     def __init__(self, path: Path):
-        super().__init__()
-        self.failure: OSError | None = None
         self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+        super().__init__()
+        self.failure: BaseException | None = None
         self._kept: list[tuple[int, bytes]] = []
         self._at, self._size = 0, 0
 
     def check(self) -> None:
-        """Raise the error of the disk, if there was one."""
+        """Raise what `failure` holds, if anything."""
         if self.failure is not None:
             raise self.failure
 
@@ -63,7 +64,7 @@ class ForgivingFile(io.RawIOBase):
             done = 0
             while self.failure is None and done < len(content):
                 done += os.pwrite(self._descriptor, content[done:], self._at + done)
-        except OSError as error:
+        except (OSError, KeyboardInterrupt) as error:  # HDF5 cannot be interrupted, either
             self.failure = error
         if self.failure is not None:
             self._kept.append((self._at, content))
@@ -90,12 +91,13 @@ class ForgivingFile(io.RawIOBase):
         if self.failure is None:
             try:
                 os.ftruncate(self._descriptor, self._size)
-            except OSError as error:
+            except (OSError, KeyboardInterrupt) as error:
                 self.failure = error
         return self._size
 
     def close(self) -> None:
         """Close it; what is kept in memory is gone."""
-        if not self.closed:
-            os.close(self._descriptor)
+        descriptor, self._descriptor = getattr(self, "_descriptor", -1), -1
         super().close()
+        if descriptor >= 0:
+            os.close(descriptor)

@@ -30,6 +30,8 @@ FORMATS = ("lerobot", "minari", "maniskill")
 """Formats of datasets."""
 NAME = "demonstrations"
 """Files of ManiSkill's format, before .h5 and .json."""
+ROOM = 65_536
+"""Room on the disk without which ManiSkill's recorder is not begun [bytes]."""
 OWN = "recording.json"
 """File of a dataset that says how it was made, and lists seed, length and success of its episodes."""
 
@@ -91,7 +93,9 @@ def new_folder(folder: Path) -> Iterator[Path]:
             raise InputError(f"{folder} exists meanwhile: nothing was written; choose another folder.")
         os.rename(temporary, folder)
     except OSError as error:
-        raise InputError(f"Cannot write {folder} ({error}): nothing was written; choose another folder.") from error
+        raise InputError(
+            f"Cannot write {folder} ({error.strerror or error}): nothing was written; choose another folder."
+        ) from error
     finally:
         if temporary is not None:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -166,6 +170,7 @@ def _facts(env: gym.Env, source: Source) -> Facts:
 def _recorder(env: gym.Env, folder: Path, source: Source) -> Iterator[tuple[RecordEpisode, ForgivingFile]]:
     """A batch whose ended episodes can be written as ManiSkill's trajectories, with rewards and all states, and the
     file into which they are written; it is closed at the end, whatever happens."""
+    (folder / f"{NAME}.h5").write_bytes(bytes(ROOM))  # a full disk is met here, and not in the recorder's own file
     recorder = RecordEpisode(
         env,  # pyright: ignore[reportArgumentType]
         str(folder),

@@ -35,6 +35,8 @@ from dora.version import source_commit
 
 POLICY = "policy.safetensors"
 """Name of the policy in the folder of a committed run."""
+NEEDED = ("seed", "eval_episodes", "stage_rates")
+"""Entries of a result that a card needs and that those of the first versions lack."""
 PAGE = Path("docs") / "policies.md"
 """Page with the table of all cards, in a checkout."""
 
@@ -98,7 +100,8 @@ def chosen(runs: list[Run], env_id: str) -> Choice | None:
     for run in runs:
         if run.result["env"] == env_id and (run.folder / POLICY).is_file():
             checkpoint = read_checkpoint(run.folder / POLICY)
-            if is_usual(checkpoint.config) and checkpoint.progress.get("best"):
+            known = all(run.result.get(name) is not None for name in NEEDED)
+            if known and is_usual(checkpoint.config) and checkpoint.progress.get("best"):
                 age = not run.outdated, not run.result.get("checkpoint")
                 found.append(((*age, checkpoint.progress["best"]), run, checkpoint))
     if not found:
@@ -122,7 +125,10 @@ def is_bundled(choice: Choice) -> bool:
     policy, card = bundled_files(choice.run.result["env"])
     if not (policy.is_file() and card.is_file()) or policy.read_bytes() != choice.path.read_bytes():
         return False
-    known, result = Card.read(card), choice.run.result
+    try:
+        known, result = Card.read(card), choice.run.result
+    except InputError:  # it is made anew
+        return False
     return (known.success_rate, known.episodes, known.run_commit) == (
         result["success_rate"], result.get("eval_episodes"), result.get("commit")
     )  # fmt: skip

@@ -104,7 +104,7 @@ def is_locked(folder: Path) -> bool:
 def last_words(folder: Path) -> str:
     """The last line that a run has printed."""
     path = folder / LOG
-    if not path.exists():
+    if not path.is_file():
         return "it printed nothing"
     with path.open("rb") as file:
         file.seek(max(path.stat().st_size - TAIL, 0))
@@ -112,19 +112,22 @@ def last_words(folder: Path) -> str:
     return next((line.strip() for line in reversed(lines) if line.strip()), "it printed nothing")
 
 
+DIGITS = 12
+"""Longest number of steps [digits]."""
+
+
 def steps_of(folder: Path) -> int:
     """Environment steps that a run has taken, from the last whole row of its progress.csv."""
     path = folder / "progress.csv"
-    if not path.exists():
+    if not path.is_file():
         return 0
     with path.open("rb") as file:
         file.seek(max(path.stat().st_size - TAIL, 0))
         lines = file.read().decode(errors="replace").split("\n")[:-1]
     for line in reversed(lines):
-        try:
-            return int(line.split(",")[0])
-        except ValueError:
-            continue
+        cell = line.split(",")[0]
+        if cell.isascii() and cell.isdigit() and len(cell) <= DIGITS:
+            return int(cell)
     return 0
 
 
@@ -133,7 +136,11 @@ def complaint(folder: Path, status: int) -> str | None:
 
     A result alone says little: it may be that of a smaller budget, with which the process has failed to go on.
     """
-    return None if status == 0 and is_finished(folder) else f"status {status}: {last_words(folder)}"
+    try:
+        finished = is_finished(folder)
+    except InputError as error:
+        return str(error)
+    return None if status == 0 and finished else f"status {status}: {last_words(folder)}"
 
 
 @dataclass

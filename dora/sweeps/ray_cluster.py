@@ -4,6 +4,7 @@ A machine that sees the folder of the sweep trains in it. One that does not trai
 that a report and an evaluation need, without the state of the learner.
 """
 
+import contextlib
 import importlib
 import os
 import signal
@@ -94,6 +95,8 @@ class RayLauncher(Launcher):
             return row, str(error.cause)
         except self._ray.exceptions.RayError as error:
             return row, f"{type(error).__name__}: {error}".splitlines()[0]
+        except (InputError, OSError) as error:
+            return row, str(error)
         return row, None
 
     def stop(self) -> None:
@@ -166,6 +169,8 @@ def receive(folder: Path, files: Mapping[str, bytes]) -> None:
     Raises:
         InputError: they cannot be written.
     """
+    with contextlib.suppress(OSError):
+        (folder / "result.json").unlink()  # that of a smaller budget, whose tables are replaced now
     for name in sorted(files, key="result.json".__eq__):
         if name in SENT:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -153,10 +153,13 @@ class Sweep:
         """Notes which runs another process trains, such as one of a sweep that was killed, and which have ended."""
         for entry in self.entries:
             if entry.state in (State.WAITING, State.ELSEWHERE):
-                locked = is_locked(entry.folder)
-                entry.state = State.ELSEWHERE if locked else State.WAITING
-                if not locked and is_finished(entry.folder):
-                    self._settle(entry, self._found())
+                try:
+                    locked = is_locked(entry.folder)
+                    entry.state = State.ELSEWHERE if locked else State.WAITING
+                    if not locked and is_finished(entry.folder):
+                        self._settle(entry, self._found())
+                except (InputError, OSError) as error:  # its folder is no good; the others may be
+                    entry.state, entry.complaint = State.FAILED, str(error)
 
     def _begin(self, launcher: Launcher) -> None:
         """Begins as many runs as there is room for."""

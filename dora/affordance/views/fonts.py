@@ -1,12 +1,16 @@
 """Fonts of this machine for names in any script."""
 
 import functools
+import unicodedata
 
 from matplotlib import font_manager, rcParams
 from matplotlib.font_manager import FontEntry, FontProperties
 
 LAST = "Last Resort"
 """Beginning of the name of a font that has a sign for the script of every character, which matplotlib brings."""
+
+INVISIBLE = ("Cc", "Cf", "Cs", "Zs", "Zl", "Zp")
+"""Categories of characters that no font has to draw."""
 
 
 def families(text: str) -> list[str]:
@@ -16,7 +20,7 @@ def families(text: str) -> list[str]:
         text: all characters to draw.
     """
     own = font_manager.findfont(FontProperties())
-    missing = {ord(letter) for letter in text if letter.isprintable() and not letter.isspace()} - _letters(own)
+    missing = {ord(letter) for letter in text if unicodedata.category(letter) not in INVISIBLE} - _letters(own)
     chosen = list(rcParams["font.family"])
     entries = sorted(font_manager.fontManager.ttflist, key=_rank)
     for entry in entries:
@@ -37,4 +41,7 @@ def _rank(entry: FontEntry) -> tuple[bool, bool, str]:
 @functools.lru_cache(maxsize=256)
 def _letters(path: str) -> frozenset[int]:
     """Codes of the characters that a font file has."""
-    return frozenset(font_manager.get_font(path).get_charmap())
+    try:
+        return frozenset(font_manager.get_font(path).get_charmap())
+    except (OSError, RuntimeError):  # gone or damaged since the list of fonts was made
+        return frozenset()

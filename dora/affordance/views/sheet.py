@@ -69,7 +69,7 @@ def _drawn(panels: Sequence[Panel], columns: int, legend: Legend | None, name: s
         axis.set_axis_off()
     for axis, panel in zip(axes, panels, strict=False):
         axis.imshow(panel.view)
-        axis.set_title(panel.title, fontsize=SIZE, parse_math=False)
+        axis.set_title(drawable(panel.title), fontsize=SIZE, parse_math=False)
         if panel.legend:
             _plain(axis.legend(
                 handles=_patches(panel.legend), loc="upper center", bbox_to_anchor=(0.5, 0.0),
@@ -78,14 +78,20 @@ def _drawn(panels: Sequence[Panel], columns: int, legend: Legend | None, name: s
     if legend:
         handles = _patches(legend)
         _plain(figure.legend(
-            handles=handles, loc="outside lower center", ncols=len(handles), fontsize=SIZE, frameon=False, title=name
+            handles=handles, loc="outside lower center", ncols=len(handles), fontsize=SIZE, frameon=False,
+            title=drawable(name),
         ))  # fmt: skip
     return figure
 
 
+def drawable(text: str) -> str:
+    """A text without parts that no letters can be, such as those of a file's name that is not in UTF-8."""
+    return text.encode(errors="replace").decode()
+
+
 def _patches(legend: Legend) -> list[Patch]:
     """A patch for each colour; matplotlib leaves out names that begin with "_", so these get a space."""
-    names = {label: f" {label}" if label.startswith("_") else label for label in legend}
+    names = {label: drawable(f" {label}" if label.startswith("_") else label) for label in legend}
     return [Patch(color=np.divide(colour, 255).tolist(), label=names[label]) for label, colour in legend.items()]
 
 

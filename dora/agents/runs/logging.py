@@ -1,9 +1,10 @@
 """What TensorBoard shows of a run: tags and what they mean, layout, hyperparameters, film, and their writer."""
 
+import contextlib
 import itertools
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from dora.agents.config import RunConfig
 from dora.configs import flat, plain
 from dora.tables import markdown_table
 
+LOST = "TensorBoard's events could not all be written"
+"""Beginning of the line about a full disk."""
 TAGS: dict[str, str] = {
     "evaluation/success_rate": "share of evaluation episodes (fixed seeds, greedy) that end in success",
     "evaluation/return_mean": "mean sum of rewards of evaluation episodes",
@@ -105,43 +108,57 @@ class RunLog:
 
     def __init__(self, folder: Path, first_step: int = 0, config: RunConfig | None = None):
         _silence_writing_thread()
-        self._writer = SummaryWriter(str(folder), purge_step=first_step or None)
+        self._writer: SummaryWriter | None = None
         self._settings = {} if config is None else flat_settings(config)
-        if first_step == 0:
-            self._writer.add_text("tags", tags_table())
-            self._writer.add_custom_scalars(LAYOUT)
-            self._add_hyperparameters(0, 1)
+        with self._writing():
+            self._writer = SummaryWriter(str(folder), purge_step=first_step or None)
+            if first_step == 0:
+                self._writer.add_text("tags", tags_table())
+                self._writer.add_custom_scalars(LAYOUT)
+                self._add_hyperparameters(self._writer, 0, 1)
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """A full disk is told once, and the run goes on without the events: it has its other files."""
+        try:
+            yield
+        except OSError as error:
+            writer, self._writer = self._writer, None
+            print(f"{LOST} ({error.strerror or error}).", file=sys.stderr)
+            with contextlib.suppress(OSError):
+                if writer is not None:
+                    writer.close()
 
     def add(self, prefix: str, values: Mapping[str, float], step: int) -> None:
         """Write `values` as `prefix/<name>`."""
-        for name, value in values.items():
-            self._writer.add_scalar(f"{prefix}/{name}", value, step)
+        with self._writing():
+            for name, value in values.items():
+                if self._writer is not None:
+                    self._writer.add_scalar(f"{prefix}/{name}", value, step)
 
     def add_learner(self, values: Mapping[str, float], step: int) -> None:
         """Write what a learner's update returned: losses and the rest."""
         for name, value in values.items():
-            kind = "loss" if name.partition("/")[0] in LOSSES else "learner"
-            self._writer.add_scalar(f"{kind}/{name}", value, step)
+            self.add("loss" if name.partition("/")[0] in LOSSES else "learner", {name: value}, step)
 
     def add_final(self, result: Mapping[str, Any], step: int) -> None:
         """Write the figures of a finished run's `result.json` that stand beside its settings."""
-        for name in FINAL:
-            if result.get(name) is not None:
-                self._writer.add_scalar(f"final/{name}", result[name], step)
-        self._add_hyperparameters(2)
+        self.add("final", {name: result[name] for name in FINAL if result.get(name) is not None}, step)
+        with self._writing():
+            if self._writer is not None:
+                self._add_hyperparameters(self._writer, 2)
 
-    def _add_hyperparameters(self, *parts: int) -> None:
+    def _add_hyperparameters(self, writer: SummaryWriter, *parts: int) -> None:
         """Write parts of what the page of hyperparameters reads: 0 their names, 1 the values, 2 that the run ended."""
         summaries = hparams(self._settings, {f"final/{name}": 0.0 for name in FINAL})
         for part in parts:
-            self._writer._get_file_writer().add_summary(summaries[part])  # add_hparams makes a folder of its own
+            writer._get_file_writer().add_summary(summaries[part])  # add_hparams makes a folder of its own
 
     def close(self) -> None:
         """Flush and close; what a full disk does not take is lost, and the run has its other files."""
-        try:
-            self._writer.close()
-        except OSError as error:
-            print(f"TensorBoard's events could not all be written ({error.strerror}).", file=sys.stderr)
+        with self._writing():
+            if self._writer is not None:
+                self._writer.close()
 
 
 def _silence_writing_thread() -> None:
@@ -176,5 +193,8 @@ def add_film(folder: Path, film: Path, step: int) -> None:
     gif: Any = imageio.mimwrite("<bytes>", frames, format="GIF", duration=milliseconds, loop=0)  # pyright: ignore
     height, width = frames[0].shape[:2]
     image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)
-    with SummaryWriter(str(folder)) as writer:
-        writer._get_file_writer().add_summary(Summary(value=[Summary.Value(tag=FILM, image=image)]), step)
+    try:
+        with SummaryWriter(str(folder)) as writer:
+            writer._get_file_writer().add_summary(Summary(value=[Summary.Value(tag=FILM, image=image)]), step)
+    except OSError as error:
+        print(f"{LOST} ({error.strerror or error}); the film is {film}.", file=sys.stderr)

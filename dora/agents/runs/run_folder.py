@@ -27,7 +27,7 @@ PACKAGES = ("mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium
 """Packages whose versions are written besides that of Dora."""
 EVALUATION = "evaluation.txt"
 """File of a folder in which a policy is only evaluated."""
-OWN_FILES = (EVALUATION, "config.yaml", "result.json", "curve.csv", "eval.csv", "progress.csv",
+OWN_FILES = (EVALUATION, "config.yaml", "result.json", "curve.csv", "eval.csv", "zero.csv", "progress.csv",
              "checkpoints/latest.safetensors", "checkpoints/best.safetensors")  # fmt: skip
 """Files by which a folder is known to hold a run."""
 CURVE_HEADER = (

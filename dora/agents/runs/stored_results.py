@@ -3,20 +3,23 @@
 import csv
 import hashlib
 import io
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from dora.digests import SEAL, is_whole, sealed
 from dora.errors import InputError, shown
-from dora.reading import read_bytes, read_json, read_text
+from dora.reading import read_json, read_text
 
 MOST_RESULT, MOST_TABLE = 1_000_000, 16_000_000
 """Size of a result.json and of a table above which it is not read [bytes]."""
 MOST_ROWS, MOST_CURVE, MOST_EPISODES = 200_000, 20_000, 20_000
 """Largest number of rows of a progress.csv, of a curve.csv, and of an eval.csv [1]."""
-MOST_COLUMNS, LONGEST_NAME = 1000, 200
-"""Largest number of columns of a table, and of characters of a text [1]."""
+MOST_COLUMNS, LONGEST_NAME, LONGEST_PATH = 1000, 200, 4096
+"""Largest number of columns of a table, and of characters of a text and of a path [1]."""
+PIECE = 2**20
+"""Size of the pieces in which a table's digest is computed [bytes]."""
 ROUNDING = 1e-4
 """Largest difference of a share that is written twice [1]."""
 LARGEST = 1e12
@@ -37,7 +40,7 @@ REQUIRED = {
 }  # fmt: skip
 """Entries of the result of a finished run, and what they are."""
 OPTIONAL = {
-    "preset": "text", "guidance_parts": "texts or none", "reward": "text", "checkpoint": "text or none",
+    "preset": "text", "guidance_parts": "texts or none", "reward": "text", "checkpoint": "path or none",
     "eval_episodes": "count", "total_steps": "count", "first_seed": "count or none", "task": "mapping",
     "other_load": "amount or none", "raw_success_rate": "share or none", "steps_to_80": "count or none",
     "stage_rates": "shares", "seed": "count", "task_config": "mapping or none", "learner_config": "mapping or none",
@@ -47,7 +50,8 @@ OPTIONAL = {
 NESTED = {"preset": "text", "guidance_parts": "texts or none"}
 """The same of entries of `task`, where the first version put them."""
 WORDS = {
-    "text": f"a text of 1 to {LONGEST_NAME} characters", "texts": "a list of texts", "mapping": "a mapping",
+    "text": f"a text of 1 to {LONGEST_NAME} characters", "path": f"a text of 1 to {LONGEST_PATH} characters",
+    "texts": "a list of texts", "mapping": "a mapping",
     "shares": "a mapping of names to numbers from 0 to 1", "share": "a number from 0 to 1",
     "count": "a whole number of at least 0", "amount": f"a number from 0 to {LARGEST:g}",
 }  # fmt: skip
@@ -58,6 +62,7 @@ def _fits(value: Any, kind: str) -> bool:
     number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
     return {
         "text": lambda: isinstance(value, str) and 0 < len(value) <= LONGEST_NAME,
+        "path": lambda: isinstance(value, str) and 0 < len(value) <= LONGEST_PATH,
         "texts": lambda: isinstance(value, list) and len(value) < MOST_COLUMNS and all(_fits(v, "text") for v in value),
         "mapping": lambda: isinstance(value, dict),
         "shares": lambda: (
@@ -92,8 +97,12 @@ def with_digests(result: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _table_digest(path: Path) -> str:
-    """sha256 of a table, the same whichever line ends a tool has given it."""
-    return hashlib.sha256(read_bytes(path, path.name, MOST_TABLE).replace(b"\r\n", b"\n")).hexdigest()
+    """sha256 of a table of any size, the same whichever line ends a tool has given it."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while piece := file.read(PIECE):
+            digest.update(piece.replace(b"\r", b""))
+    return digest.hexdigest()
 
 
 def _check_digests(result: dict[str, Any], path: Path) -> None:
@@ -101,10 +110,10 @@ def _check_digests(result: dict[str, Any], path: Path) -> None:
     if (SEAL in result or OF_TABLES in result) and not is_whole(result):
         raise InputError(f"{path} is damaged (its digest differs); repeat the run or remove its folder.")
     if result.get("finished"):  # else the tables go on
-        for name, digest in result.get(OF_TABLES, {}).items():
-            table = path.with_name(name)
-            if name in TABLES and table.is_file() and _table_digest(table) != digest:
-                raise _damaged(table, "its digest in result.json differs")
+        for table in (path.with_name(name) for name in TABLES if OF_TABLES in result):
+            digest = result[OF_TABLES].get(table.name)
+            if table.is_file() and table.stat().st_size <= MOST_TABLE and _table_digest(table) != digest:
+                raise _damaged(table, "its digest in result.json differs" if digest else "result.json does not know it")
 
 
 def read_result(path: Path) -> dict[str, Any] | None:
@@ -164,6 +173,8 @@ def read_episodes(path: Path) -> dict[str, list[float]]:
         raise _damaged(path, "it has no episode")
     if not all(value in (0.0, 1.0) for value in columns["success"]):
         raise _damaged(path, "success is not 0 or 1 everywhere")
+    if unknown := [name for name, values in columns.items() if any(map(math.isnan, values))]:
+        raise _damaged(path, f"{unknown[0]} is no number somewhere")
     return columns
 
 
