@@ -251,6 +251,23 @@ def test_a_run_that_was_only_evaluated_again_comes_last_but_for_one_of_earlier_r
     assert last.run is again
 
 
+@pytest.mark.parametrize(("known", "again", "made"), [(True, False, 0), (True, True, 1), (False, False, 1)])
+def test_a_policy_that_is_bundled_already_is_made_anew_only_if_that_is_asked_for(
+    known: bool, again: bool, made: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    done: list[str] = []
+    monkeypatch.chdir(tmp_path)  # no page to refresh
+    monkeypatch.setattr(bundle, "is_bundled", lambda choice: known)
+    monkeypatch.setattr(bundle, "count_runs", lambda choice: None)
+    monkeypatch.setattr(bundle, "bundle", lambda choice, *_: done.append(choice.run.result["env"]))
+    words = ["bundle", str(RESULTS), "--env", "DoraCube-v1", *(["--again"] if again else [])]
+    monkeypatch.setattr(sys, "argv", words)
+    assert bundle.main() == 0
+    assert len(done) == made
+    assert ("is bundled already" in capsys.readouterr().out) == (not made)
+
+
 def test_a_result_of_a_version_without_what_a_card_needs_is_passed_over() -> None:
     runs = [
         dataclasses.replace(run, result={k: v for k, v in run.result.items() if k != "eval_episodes"})
