@@ -36,6 +36,8 @@ from dora.agents.reports.report import tables, write_report
 from dora.agents.reports.run_results import find_runs
 from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.run_folder import RunFolder
+from dora.agents.runs.stored_results import OF_TABLES
+from dora.digests import SEAL
 from dora.live.recordings import Recording
 from dora.policies.card import Card
 from dora.policies.policy import bundled_files
@@ -153,6 +155,13 @@ def write_result(folder: Path) -> None:
     for step in range(100, 1100, 100):
         table.add({"env_steps": step, "seconds": step / 10, "episodes": 3, "success_rate": 0.5, "return_mean": 1.0})
     RunFolder(folder).write_result(result)
+
+
+def write_old_result(folder: Path) -> None:
+    """A result of a version without digests, which those who read it check all the same."""
+    write_result(folder)
+    result = json.loads((folder / "result.json").read_text())
+    (folder / "result.json").write_text(json.dumps({k: v for k, v in result.items() if k not in (SEAL, OF_TABLES)}))
 
 
 def load_results(folder: Path) -> object:

@@ -241,7 +241,7 @@ def test_the_message_of_a_failing_worker_arrives(ahead: bool):
 def children() -> set[str]:
     """Python processes started by this one, but for the interpreter's own, which end with it."""
     out = subprocess.run(
-        ["ps", "--ppid", str(os.getpid()), "-o", "pid=,args="], capture_output=True, text=True, check=True
+        ["ps", "-ww", "--ppid", str(os.getpid()), "-o", "pid=,args="], capture_output=True, text=True, check=True
     ).stdout
     own = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
     return {line.strip() for line in out.splitlines() if "python" in line and not any(name in line for name in own)}

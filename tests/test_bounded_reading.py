@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from boxes import two_regions
-from probes import load_results, write_result
+from probes import load_results, write_old_result
 from refusals import ENTITIES, refused, written
 
 from dora.affordance.maps.packed_maps import COUNT, PART, POINT, unpack
@@ -203,7 +203,7 @@ def test_xml_that_is_small_is_read(tmp_path: Path):
     ],
 )
 def test_tables_of_runs(tmp_path: Path, table: str, content: str, words: str):
-    write_result(tmp_path)
+    write_old_result(tmp_path)
     load_results(tmp_path)
     with refused(words):
         write_report(written(tmp_path / table, content).parent, tmp_path / "out")
@@ -234,14 +234,14 @@ def test_tables_of_runs(tmp_path: Path, table: str, content: str, words: str):
     ],
 )
 def test_results_of_another_type(tmp_path: Path, name: str, value: Any):
-    write_result(tmp_path)
+    write_old_result(tmp_path)
     result = json.loads((tmp_path / "result.json").read_text())
     with refused("result.json is damaged"):
         load_results(written(tmp_path / "result.json", json.dumps(result | {name: value})).parent)
 
 
 def test_names_from_files_are_text_in_figures_and_on_pages(tmp_path: Path):
-    write_result(tmp_path)
+    write_old_result(tmp_path)
     result = json.loads((tmp_path / "result.json").read_text())
     name = "$\\frac{$_<b>[x](y)"
     written(tmp_path / "result.json", json.dumps(result | {"env": name, "guidance": "$x_{$"}))

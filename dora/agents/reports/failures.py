@@ -13,7 +13,7 @@ CHECKS = {
     "too much overlap": "raw_success",
 }  # fmt: skip
 """Causes that come before those of the stages, and the columns that are above 0 where they apply."""
-Table: TypeAlias = Mapping[str, Float[np.ndarray, " e"]]
+Table: TypeAlias = Mapping[str, Float[np.ndarray, " _"]]
 """Columns of an eval.csv by name, a value for each episode."""
 
 
@@ -33,7 +33,7 @@ def first_causes(table: Table, max_steps: int | None = None) -> dict[str, int]:
     return counts
 
 
-def _causes(table: Table, max_steps: int | None) -> Iterator[tuple[str, Bool[np.ndarray, " e"]]]:
+def _causes(table: Table, max_steps: int | None) -> Iterator[tuple[str, Bool[np.ndarray, " _"]]]:
     """Causes in the order in which they count, and the episodes to which they apply."""
     for cause, name in CHECKS.items():
         if name in table:
