@@ -92,6 +92,13 @@ def test_files_that_arrive_over_an_older_result_take_its_place_at_last(tmp_path:
     assert not (tmp_path / "result.json").exists()
 
 
+def test_a_result_stays_where_no_files_arrive(tmp_path: Path):
+    """The machine has written into the folder of the sweep itself."""
+    (tmp_path / "result.json").write_text("{}")
+    ray_cluster.receive(tmp_path, {})
+    assert (tmp_path / "result.json").exists()
+
+
 def test_steps_are_read_from_files_with_sensible_numbers_alone(tmp_path: Path):
     os.mkfifo(tmp_path / "progress.csv")
     assert steps_of(tmp_path) == 0

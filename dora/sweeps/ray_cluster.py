@@ -169,8 +169,9 @@ def receive(folder: Path, files: Mapping[str, bytes]) -> None:
     Raises:
         InputError: they cannot be written.
     """
-    with contextlib.suppress(OSError):
-        (folder / "result.json").unlink()  # that of a smaller budget, whose tables are replaced now
+    if files:  # else the machine has written into this very folder
+        with contextlib.suppress(OSError):
+            (folder / "result.json").unlink()  # that of a smaller budget, whose tables are replaced now
     for name in sorted(files, key="result.json".__eq__):
         if name in SENT:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
