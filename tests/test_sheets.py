@@ -1,7 +1,7 @@
 """Sheets of pictures show names in any script."""
 
-import dataclasses
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -36,7 +36,11 @@ def test_installed_fonts_are_used_for_what_the_own_one_lacks():
 
 
 def test_a_name_that_is_not_in_utf_8_is_drawn_as_far_as_it_goes(tmp_path: Path):
-    write_sheet([Panel(np.zeros((90, 90, 3), np.uint8), "caf\udce9")], tmp_path / "sheet.png", 1, name="\udce9\ue000")
+    panel = Panel(np.zeros((90, 90, 3), np.uint8), "caf\udce9")
+    write_sheet([panel], tmp_path / "sheet.png", 1, {"\udce9": (255, 0, 0)}, name="\udce9\ue000")
+    whole = replace(panel, title="caf?")
+    write_sheet([whole], tmp_path / "whole.png", 1, {"?": (255, 0, 0)}, name="?\ue000")
+    assert (tmp_path / "sheet.png").read_bytes() == (tmp_path / "whole.png").read_bytes()
 
 
 @pytest.mark.parametrize("content", [None, b"no font"])
@@ -46,6 +50,6 @@ def test_a_font_that_is_gone_or_damaged_is_passed_over(
     path = tmp_path / "font.ttf"
     if content is not None:
         path.write_bytes(content)
-    gone = dataclasses.replace(font_manager.fontManager.ttflist[0], fname=str(path), name="Aaa Gone")
+    gone = replace(font_manager.fontManager.ttflist[0], fname=str(path), name="Aaa Gone")
     monkeypatch.setattr(font_manager.fontManager, "ttflist", [gone, *font_manager.fontManager.ttflist])
     assert "Aaa Gone" not in families("把手")

@@ -134,6 +134,7 @@ def record_dataset(
             stack.callback(env.close)
 
             def episodes() -> Iterator[Episode]:
+                """What the source does, episode by episode, counted; OSError on a disk that is full."""
                 for row, episode in roll_out(env, source.act, plan, progress):
                     if recorder is not None and below is not None:
                         recorder.flush_trajectory(env_idxs_to_flush=[row])
