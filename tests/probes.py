@@ -38,7 +38,7 @@ from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.run_folder import RunFolder
 from dora.agents.runs.stored_results import OF_TABLES
 from dora.digests import SEAL
-from dora.live.recordings import Recording
+from dora.live.recordings import Recording, seal
 from dora.policies.card import Card
 from dora.policies.policy import bundled_files
 from dora.robot import loading, mirror, visuals
@@ -297,6 +297,12 @@ def write_recording(folder: Path) -> None:
     (folder / "recorded.json").write_text(json.dumps({"env_info": info, "episodes": episodes}))
 
 
+def write_own_recording(folder: Path) -> None:
+    """The same as Dora writes it, with digests."""
+    write_recording(folder)
+    seal(folder / "recorded.h5")
+
+
 def load_recording(folder: Path) -> None:
     Recording.open(folder / "recorded.h5").episode(0)
 
@@ -317,7 +323,8 @@ LOADERS: dict[str, Loader] = {
     "curve.csv": Loader(write_result, load_results, ("curve.csv",), sealed=True),
     "progress.csv": Loader(write_result, load_results, ("progress.csv",), sealed=True),
     "eval.csv": Loader(write_result, load_report, ("eval.csv", "zero.csv"), sealed=True),
-    "recording": Loader(write_recording, load_recording),
+    "recording": Loader(write_own_recording, load_recording, sealed=True),
+    "recording, others": Loader(write_recording, load_recording),
     "report": Loader(write_result, load_report, ("*.json", "*.csv"), sealed=True),
     "robot.toml": Loader(write_robot, load_robot, ("robot.toml",)),
     "robot.urdf": Loader(write_robot, load_robot, ("robot.urdf",)),

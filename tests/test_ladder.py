@@ -1,5 +1,7 @@
 """The ladder of guidance: what each step takes away, what stays the same, and whether the reach filter pays."""
 
+import json
+import sys
 from typing import Any
 
 import pytest
@@ -8,9 +10,11 @@ from torch import Tensor
 
 import dora.tasks as tasks
 from dora.affordance.bundled_sets import load_candidates
+from dora.affordance.reach.approach_paths import OK
+from dora.commands import bench
 from dora.geometry.rotations import quaternion_from_rotation_vector
 from dora.tasks.mdp.guidance_parts import PARTS
-from dora.tools.filter_benchmark import outcomes
+from dora.tools.filter_benchmark import Outcomes, outcomes
 
 
 @pytest.mark.parametrize(
@@ -134,3 +138,37 @@ def test_what_f_reach_rejects_fails_more_than_twice_as_often():
     print(f"accepted candidates fail in {accepted:.2f}, rejected ones in {rejected:.2f}")
     assert rejected > 2 * accepted
     assert rejected > 0.5
+
+
+@pytest.mark.slow
+def test_f_reach_pays_on_the_cube_for_a_policy_that_has_learned(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """With zero correction half of what can be carried out fails, by errors of the candidate that a policy undoes."""
+    monkeypatch.setattr(sys, "argv", ["bench", "filter", "DoraCube-v1", "--policy", "--episodes", "64", "--json"])
+    assert bench.main() == 0
+    printed = json.loads(capsys.readouterr().out.splitlines()[-1])["random"]
+    assert printed["accepted"] + printed["rejected"] == 64
+    assert printed["rejected_failed"] > 2 * printed["accepted_failed"]
+    assert printed["accepted_failed"] < 0.1
+
+
+def test_outcomes_are_counted_by_what_f_reach_says(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    mixed = Outcomes(torch.tensor([OK, OK, OK + 1, OK + 1, OK + 1]), torch.tensor([True, False, False, False, True]))
+    assert mixed.summary() == {
+        "accepted": 2,
+        "rejected": 3,
+        "accepted_failed": 0.5,
+        "rejected_failed": pytest.approx(2 / 3),
+    }
+    alone = Outcomes(torch.tensor([OK] * 5), torch.ones(5, dtype=torch.bool))
+    assert alone.summary() == {"accepted": 5, "rejected": 0, "accepted_failed": 0.0, "rejected_failed": None}
+    monkeypatch.setattr(
+        bench, "outcomes", lambda env, episodes, preset, choice, act: mixed if choice == "random" else alone
+    )
+    bench.bench_filter("DoraJug-v1")
+    printed = capsys.readouterr().out
+    assert "failed: 0.000 of the accepted\n" in printed
+    assert "failed: 0.500 of the accepted, 0.667 of the rejected" in printed
+    bench.bench_filter("DoraJug-v1", json=True)
+    assert json.loads(capsys.readouterr().out)["nearest"]["rejected_failed"] is None

@@ -1,6 +1,7 @@
 """Recorded episodes are played as they were recorded, and files that are none are refused in one sentence."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,11 @@ from live import Watched
 from dora.datasets.episodes import Plan
 from dora.datasets.record import record_dataset
 from dora.datasets.sources import find_source
+from dora.digests import SEAL
 from dora.errors import InputError
 from dora.live.orders import Choose, Play, Randomise, Start
 from dora.live.players import ZERO, recorded, zero_correction
-from dora.live.recordings import Recording
+from dora.live.recordings import TRAJECTORIES, Recording
 
 
 @pytest.fixture(scope="module")
@@ -63,10 +65,11 @@ def test_an_episode_begins_in_its_recorded_state_whatever_its_seed(recording: Pa
 
 
 def damaged(path: Path, folder: Path, how: str) -> Path:
-    """A copy of a recording with something wrong."""
+    """A copy of a recording with something wrong, and without the digests that would tell."""
     copy = folder / "copy.h5"
     shutil.copy(path, copy)
     index = json.loads(path.with_suffix(".json").read_text())
+    index = {name: value for name, value in index.items() if name not in (SEAL, TRAJECTORIES)}
     if how == "stock":
         index["env_info"]["env_id"] = "PickCube-v1"
     elif how == "empty":
@@ -115,6 +118,23 @@ def test_a_file_that_is_no_recording_is_refused(recording: Path, tmp_path: Path,
     path = damaged(recording, tmp_path, how)
     with pytest.raises(InputError, match=words):
         Recording.open(path).episode(0)
+
+
+@pytest.mark.parametrize("changed", ["copy.h5", "copy.json"])
+@pytest.mark.parametrize("place", [0.2, 0.5, 0.8])
+def test_any_change_of_a_recording_of_ours_is_found(recording: Path, tmp_path: Path, changed: str, place: float):
+    for end in (".h5", ".json"):
+        shutil.copy(recording.with_suffix(end), tmp_path / f"copy{end}")
+    copy = tmp_path / "copy.h5"
+    assert len(Recording.open(copy).episode(0).actions)
+    content = bytearray((tmp_path / changed).read_bytes())
+    at = int(place * len(content))
+    if changed.endswith("json"):
+        at = re.compile(rb"(?<=[\d.])\d").search(content, at).start()  # pyright: ignore[reportOptionalMemberAccess]
+    content[at] ^= 1
+    (tmp_path / changed).write_bytes(content)
+    with pytest.raises(InputError, match=rf"{changed} was damaged or changed after it was written: record it again"):
+        Recording.open(copy)
 
 
 def test_a_missing_file_is_refused(tmp_path: Path):

@@ -2,7 +2,8 @@
 
 import dataclasses
 import json
-from typing import Literal
+from math import isnan
+from typing import Literal, get_args
 
 import torch
 import tyro
@@ -13,6 +14,7 @@ from dora.commands import play
 from dora.errors import InputError, command
 from dora.live import page_rate
 from dora.parallel import available_cores
+from dora.policies.policy import load_policy
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
 from dora.tables import print_table
@@ -20,9 +22,12 @@ from dora.tasks import check_task_id, find_task, make_task
 from dora.tools import env_benchmark as benchmark
 from dora.tools import grasp_benchmark
 from dora.tools import physics_benchmark as task_physics
+from dora.tools.filter_benchmark import HEAD, Choice, outcome_rows, outcomes
 
 LONGEST = 86_400.0
 """Longest time of a measurement of learners [s]."""
+MOST_EPISODES = 10_000
+"""Most episodes of a comparison."""
 
 
 def bench_env(
@@ -132,6 +137,36 @@ def bench_page(
     report(dataclasses.asdict(page_rate.measure(env, players, seconds, preset)), json)
 
 
+def bench_filter(
+    env: tyro.conf.Positional[str] = "DoraJug-v1",
+    episodes: int = 1000,
+    preset: Literal["none", "standard", "hard"] = "standard",
+    policy: bool = False,
+    json: bool = False,
+) -> None:
+    """Whether the reach filter pays: how often candidates fail that f_reach accepts, and those that it rejects.
+
+    Args:
+        env: a task of one arm with a table of f_reach.
+        episodes: with the candidates that the task would choose, and with random ones; whole batches of 64 each.
+        preset: how much episodes are randomised.
+        policy: let the policy that comes with Dora act; otherwise the zero action does.
+        json: print one JSON object on the last line instead of a table.
+    """
+    if not 0 < episodes <= MOST_EPISODES:
+        raise InputError(f"--episodes is {episodes}: give a number from 1 to {MOST_EPISODES}.")
+    act = load_policy(env) if policy else None
+    found = {choice: outcomes(env, episodes, preset, choice, act=act) for choice in get_args(Choice)}
+    if json:
+        report({"env": env, "preset": preset, "policy": policy, **{c: f.summary() for c, f in found.items()}}, True)
+        return
+    for choice, outcome in found.items():
+        print(f"\n{env}, {preset}, {choice} candidates:")
+        print_table(HEAD, outcome_rows(outcome))
+        shares = zip(("accepted", "rejected"), outcome.failure_rates(), strict=True)
+        print("failed:", ", ".join(f"{share:.3f} of the {name}" for name, share in shares if not isnan(share)))
+
+
 def report(result: dict, as_json: bool) -> None:
     """Print a result as a table or as one line of JSON."""
     if as_json:
@@ -141,7 +176,8 @@ def report(result: dict, as_json: bool) -> None:
 
 
 KINDS = {
-    "env": bench_env, "grasp": bench_grasp, "learner": bench_learner, "page": bench_page, "physics": bench_physics,
+    "env": bench_env, "filter": bench_filter, "grasp": bench_grasp, "learner": bench_learner, "page": bench_page,
+    "physics": bench_physics,
 }  # fmt: skip
 """What `dora bench NAME` does."""
 

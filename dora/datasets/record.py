@@ -22,6 +22,7 @@ from dora.datasets.minari import write_minari
 from dora.datasets.tables import require_pyarrow
 from dora.errors import InputError
 from dora.files import check_new_name, make_folder, write_json
+from dora.live.recordings import seal
 from dora.parallel import folder_beside
 from dora.sim.batch.rendering import can_render
 from dora.version import version_line
@@ -145,6 +146,8 @@ def record_dataset(
 
             options = json.loads(json.dumps(dict(source.options)))  # tuples become lists
             _write(kind, place, env, options, source, episodes())
+        if kind == "maniskill":
+            seal(place / f"{NAME}.h5")
         made = {"env": source.env_id, "options": options, "policy": source.name, "description": source.description}
         write_json(place / OWN, {**made, "version": version_line(), "episodes": table})
     return summary

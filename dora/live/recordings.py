@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import zlib
 from collections.abc import Mapping
@@ -14,7 +15,9 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
+from dora.digests import SEAL, is_whole, sealed
 from dora.errors import InputError, shown
+from dora.files import write_json
 from dora.reading import check_size, read_json
 from dora.tasks import check_task_id
 
@@ -32,6 +35,8 @@ KEPT = ("guidance", "guidance_parts", "hand_joints", "preset", "config", "contro
 """Arguments of a task that say what its actions and states mean; the others are of the machine that recorded."""
 PREFIX = "dora:"
 """What our ids begin with in a recording."""
+TRAJECTORIES = "trajectories_digest"
+"""Entry of an index with the sha256 of the trajectory file beside it."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ class Recording:
         """Reads the index.
 
         Raises:
-            InputError: a file is missing or something else, or the recording is of no Dora task.
+            InputError: a file is missing, damaged or something else, or the recording is of no Dora task.
         """
         check_size(path, "trajectory file", MOST_BYTES)
         index_path = path.with_suffix(".json")
@@ -81,6 +86,7 @@ class Recording:
         episodes = index.get("episodes") if isinstance(index, dict) else None
         if not isinstance(info, dict) or not isinstance(episodes, list) or not isinstance(info.get("env_id"), str):
             raise InputError(f"{index_path} is no index of a ManiSkill recording: name the .h5 file of one.")
+        _check_whole(path, index)
         env_id = info["env_id"].removeprefix(PREFIX)
         check_task_id(env_id)
         kwargs: Any = info.get("env_kwargs")
@@ -109,6 +115,49 @@ class Recording:
         if actions.ndim != 2 or not len(actions) or not np.isfinite(actions).all():
             raise InputError(f"{self.path}: the actions of {name} are no table of finite numbers: record it again.")
         return RecordedEpisode(seed, actions, state)
+
+
+def seal(path: Path) -> None:
+    """Write both digests into the index of a recording.
+
+    Args:
+        path: of the trajectory file (HDF5), with its index (JSON) beside it.
+
+    Raises:
+        OSError: a file cannot be read or written.
+    """
+    index = path.with_suffix(".json")
+    write_json(index, sealed(read_json(index, "index of a recording") | {TRAJECTORIES: _sha256(path)}))
+
+
+def _check_whole(path: Path, index: Mapping[str, Any]) -> None:
+    """Refuse a recording that is no longer as `seal` left it; one without digests, of another program, passes.
+
+    Args:
+        path: of the trajectory file.
+        index: what its index holds.
+
+    Raises:
+        InputError: a file was damaged or changed.
+        OSError: the trajectory file cannot be read.
+    """
+    if SEAL not in index and TRAJECTORIES not in index:
+        return
+    changed = None
+    if not is_whole(index):
+        changed = path.with_suffix(".json")
+    elif index.get(TRAJECTORIES) != _sha256(path):
+        changed = path
+    if changed is not None:
+        raise InputError(
+            f"{changed} was damaged or changed after it was written: record it again, or remove {SEAL} and "
+            f"{TRAJECTORIES} from the index to play it as it is."
+        )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _named(episode: Any, path: Path) -> tuple[str, int]:

@@ -1,26 +1,22 @@
-"""How well f_reach tells what the scripted solution can carry out: outcomes of accepted and of rejected candidates.
+"""How well f_reach tells what can be carried out: outcomes of candidates that it accepts and that it rejects.
 
-    python -m dora.tools.filter_benchmark DoraJug-v1 --episodes 1000
-
-Episodes follow candidates whether f_reach accepts them or not, with zero correction: those that the task would choose
-without the filter ("nearest"), and random ones, half of them rejected ("random"). What is rejected has to fail at least
-twice as often as what is accepted, or the filter does not pay.
+Episodes follow candidates whether f_reach accepts them or not: those that the task would choose without the filter
+("nearest"), or random ones, half of them rejected ("random"). What is rejected has to fail at least twice as often as
+what is accepted, or the filter does not pay. `dora bench filter DoraJug-v1` prints both.
 """
 
-import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import isnan
 from typing import Any, Literal
 
 import torch
-import tyro
 from jaxtyping import Bool, Int
 from torch import Tensor
 
 from dora.affordance.reach.approach_paths import OK, REASONS
-from dora.errors import InputError, command
+from dora.errors import InputError
 from dora.progress import ProgressDisplay
-from dora.tables import text_table
 from dora.tasks import check_task_id, find_task, make_task, task_ids
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.mdp.guidance_parts import FILTER, PARTS
@@ -40,18 +36,6 @@ Choice = Literal["nearest", "random"]
 """How candidates are chosen."""
 
 
-@dataclass
-class Args:
-    """Compare outcomes of candidates that f_reach accepts and rejects."""
-
-    env: tyro.conf.Positional[str]
-    """Task with a table of f_reach, for example DoraJug-v1."""
-    episodes: int = 1000
-    """Episodes of each way of choosing, rounded up to batches of 64."""
-    preset: Literal["none", "standard", "hard"] = "standard"
-    """How much episodes are randomised."""
-
-
 @dataclass(frozen=True)
 class Outcomes:
     """Of e episodes: `reason`, an index into `REASONS`, of the candidate that was followed, and `success`."""
@@ -63,6 +47,17 @@ class Outcomes:
         """Share of accepted and of rejected candidates that failed; NaN without any."""
         accepted, failed = self.reason == OK, (~self.success).float()
         return failed[accepted].mean().item(), failed[~accepted].mean().item()
+
+    def summary(self) -> dict[str, int | float | None]:
+        """Numbers of accepted and of rejected candidates, and the shares that failed; None without any."""
+        accepted, rejected = (None if isnan(rate) else rate for rate in self.failure_rates())
+        count = int((self.reason == OK).sum())
+        return {
+            "accepted": count,
+            "rejected": len(self.reason) - count,
+            "accepted_failed": accepted,
+            "rejected_failed": rejected,
+        }
 
 
 class _Drawn:
@@ -95,8 +90,23 @@ def tabulated_ids() -> list[str]:
     return [env_id for env_id, task in alone.items() if task(task.CONFIG()).start_grid(*task.ARMS) is not None]
 
 
-def outcomes(env_id: str, episodes: int, preset: str, choice: Choice, config: dict[str, Any] | None = None) -> Outcomes:
-    """Runs episodes with zero correction and without the filter; `config` as for `make_task`.
+def outcomes(
+    env_id: str,
+    episodes: int,
+    preset: str,
+    choice: Choice,
+    config: dict[str, Any] | None = None,
+    act: Callable[[Tensor], Tensor] | None = None,
+) -> Outcomes:
+    """Runs episodes without the filter.
+
+    Args:
+        env_id: of a task of one arm with a table of f_reach.
+        episodes: how many, rounded up to batches of 64.
+        preset: how much they are randomised.
+        choice: how candidates are chosen.
+        config: numbers of the task, as for `make_task`.
+        act: gives actions (64, a) for observations (64, o); zero correction if it is left out.
 
     Raises:
         InputError: there is no such task, or it has several arms or no table of f_reach.
@@ -111,9 +121,9 @@ def outcomes(env_id: str, episodes: int, preset: str, choice: Choice, config: di
     with ProgressDisplay() as phases:
         report, batches = phases.phase(f"{choice} candidates", "episodes"), -(-episodes // BATCH)
         for batch in range(batches):
-            task.reset(seed=SEED + batch)
+            obs, _ = task.reset(seed=SEED + batch)
             reasons.append(_followed(task))
-            won.append(play_out(task, lambda: torch.zeros(BATCH, task.action_size))[0].cpu())
+            won.append(play_out(task, act or (lambda _: torch.zeros(BATCH, task.action_size)), obs)[0].cpu())
             report((batch + 1) * BATCH, batches * BATCH)
     task.close()
     return Outcomes(torch.cat(reasons), torch.cat(won))
@@ -132,18 +142,3 @@ def outcome_rows(found: Outcomes) -> list[Sequence[str]]:
             wins = found.success[found.reason == index].float()
             rows.append((name, str(len(wins)), f"{wins.mean():.3f}"))
     return rows
-
-
-@command
-def main() -> None:
-    """Print both comparisons."""
-    args = tyro.cli(Args, description=__doc__)
-    for choice in ("nearest", "random"):
-        found = outcomes(args.env, args.episodes, args.preset, choice)
-        accepted, rejected = found.failure_rates()
-        print(f"\n{args.env}, {args.preset}, {choice} candidates:\n{text_table(HEAD, outcome_rows(found))}")
-        print(f"accepted candidates fail in {accepted:.3f}, rejected ones in {rejected:.3f}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -94,7 +94,7 @@ def outcome(args: Args, act: Act, error: float, report: Callable[[int, int], obj
         task.reset(seed=[SEED + batch * BATCH + row for row in range(BATCH)])
         action = act(task)
         sizes.append(float(action.square().mean()))
-        won, failed, info = play_out(task, lambda action=action: action)
+        won, failed, info = play_out(task, lambda _, action=action: action)
         success.append(won.cpu())
         raw.append((info["raw_success"] & ~failed).cpu())
         report((batch + 1) * BATCH, batches * BATCH)

@@ -103,7 +103,7 @@ def _executed(env_id: str, physics: Physics, starts: int, preset: str, seed: int
     try:
         task.reset(seed=seed)
         begun = time.process_time()
-        won, _, info = play_out(task, lambda: torch.zeros(starts, task.action_size))
+        won, _, info = play_out(task, lambda _: torch.zeros(starts, task.action_size))
         spent = time.process_time() - begun
         max_penetration = task.snapshot.max_penetration
     finally:

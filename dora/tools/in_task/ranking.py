@@ -176,7 +176,7 @@ def _executed(task: DoraEnv, seed: int, region: bool) -> dict[str, Bool[Tensor, 
     """By arm, which of n episodes of the scripted solution succeed, or hold the object in the end whatever its region,
     without failure on the way and within `CLEAN`."""
     task.reset(seed=seed)
-    success, failed, _ = play_out(task, task.scripted_action)
+    success, failed, _ = play_out(task, lambda _: task.scripted_action())
     clean = ~failed & (task.memory.max_penetration <= CLEAN * task.config.penetration_limit)
     if isinstance(task.machine, ParallelStages):
         return {arm: machine.finished & clean for arm, machine in task.machine.machines.items()}
