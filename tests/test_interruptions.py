@@ -10,7 +10,7 @@ from dora.agents.checkpoint import Checkpoint
 from dora.agents.config import RunConfig
 from dora.agents.runs.run_folder import RunFolder
 from dora.commands import interruptions
-from dora.commands.interruptions import END, FIRST_LINE, Outcome, judged, resumed
+from dora.commands.interruptions import END, FIRST_LINE, SHORT, Outcome, judged, resumed
 
 GOOD: dict[str, Any] = {"line": 0.3, "end": 2.0, "status": 143, "said": "Interrupted: saving.\n", "left": frozenset()}
 """What SIGTERM should make of a run."""
@@ -23,7 +23,7 @@ def judge(folder: Path, monkeypatch: pytest.MonkeyPatch, number: int = signal.SI
     end = found["line"], found["end"], found["status"], found["said"], 4711
     monkeypatch.setattr(interruptions, "interrupt", lambda *_: end)
     monkeypatch.setattr(interruptions, "left_behind", lambda process: found["left"])
-    return judged(number, 5.0, folder, group=False)
+    return judged(number, 5.0, folder, group=False, options=SHORT)
 
 
 @pytest.mark.parametrize(
@@ -55,6 +55,17 @@ def test_of_a_killed_run_neither_line_nor_status_nor_what_is_left_is_asked(
     outcome = judge(tmp_path, monkeypatch, signal.SIGKILL, status=-9, line=None, left=LEFT)
     assert outcome.problems == []
     assert outcome.left == LEFT
+
+
+def test_semaphores_that_nobody_can_remove_are_a_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(interruptions, "SHARED", tmp_path)
+    there = [tmp_path / "sem.mp-before0", tmp_path / "sem.mp-dora-1-2-3-abcdefgh", tmp_path / "other"]
+    for path in there:
+        path.touch()
+    assert interruptions.nameless() == {str(there[0])}
+    found: list[frozenset[str]] = [frozenset(), frozenset({"sem.mp-abcdefgh"})]
+    monkeypatch.setattr(interruptions, "nameless", lambda: found.pop(0))
+    assert "sem.mp-abcdefgh" in judge(tmp_path, monkeypatch, signal.SIGKILL).problems[0]
 
 
 def test_the_steps_of_a_run_are_those_of_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

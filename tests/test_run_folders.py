@@ -199,6 +199,34 @@ if __name__ == "__main__":
 """
 
 
+TRAINING = """
+import dataclasses, sys
+from multiprocessing.synchronize import SemLock
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+if __name__ == "__main__":
+    from short_runs import BASE, PointMass, RunFolder, Trainer
+    from dora.agents.config import SACConfig
+    made, make_name = [], SemLock._make_name
+    SemLock._make_name = staticmethod(lambda: made.append(make_name()) or made[-1])
+    folder, config = RunFolder(Path(sys.argv[2])), dataclasses.replace(BASE, agent="sac", learner=SACConfig())
+    folder.create(config)
+    Trainer(config, PointMass, folder)
+    print(*made, flush=True)
+"""
+
+
+@pytest.mark.skipif(not parallel.SHARED.is_dir(), reason="semaphores have no names here")
+def test_every_semaphore_of_a_run_tells_which_process_made_it(tmp_path: Path):
+    """Also those of the replay buffer, which are made before any worker process."""
+    script = tmp_path / "training.py"
+    script.write_text(TRAINING)
+    words = [sys.executable, str(script), str(Path(__file__).parent), str(tmp_path / "run")]
+    names = subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()
+    assert names
+    assert all(name.startswith("/mp-dora-") for name in names), names
+
+
 @pytest.mark.skipif(not parallel.SHARED.is_dir(), reason="semaphores have no names here")
 def test_what_killed_processes_left_is_removed_at_the_next_start(tmp_path: Path):
     """Not before their end, and nothing that another process may use."""

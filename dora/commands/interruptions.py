@@ -32,7 +32,7 @@ FIRST_LINE = 2.0
 END = 20.0
 """Time within which it ends [s]."""
 SHORT = (
-    *("--env", "DoraCube-v1", "--num-envs", "16", "--workers", "1", "--total-steps", "3000", "--eval-every", "1500"),
+    *("--num-envs", "16", "--workers", "1", "--total-steps", "3000", "--eval-every", "1500"),
     *("--eval-episodes", "16", "--eval-envs", "16", "--episodes", "32", "--checkpoint-seconds", "2"),
 )
 """Options of a short run: start-up, training, an evaluation, training, the last evaluation."""
@@ -66,6 +66,11 @@ def left_behind(process: int) -> frozenset[str]:
     """Names in the shared memory and among temporary files that hold the number of a process that made them."""
     places = (SHARED, Path(tempfile.gettempdir()))
     return frozenset(str(path) for place in places for path in place.glob(f"*[-_]{process}[-_]*"))
+
+
+def nameless() -> frozenset[str]:
+    """Semaphores of Python programs whose names do not say which process made them: nobody can ever remove them."""
+    return frozenset(str(path) for path in SHARED.glob("sem.mp-*") if not path.name.startswith("sem.mp-dora-"))
 
 
 def command(*options: str) -> list[str]:
@@ -122,12 +127,15 @@ def interrupt(
 
 
 def judged(
-    number: int, moment: float, folder: Path, group: bool, options: tuple[str, ...] = SHORT, training: bool = False
+    number: int, moment: float, folder: Path, group: bool, options: tuple[str, ...], training: bool = False
 ) -> Outcome:
     """Interrupt a new run in `folder` and judge how it ends; a run that had finished before is judged, too."""
     words, after = command(*options, "--out", str(folder)), RunFolder(folder).progress if training else None
+    before = nameless()
     line, end, status, said, process = interrupt(words, number, moment, group, after)
     problems, steps = [], None
+    if new := nameless() - before:
+        problems.append(f"left without the name of a process, unless by another program: {', '.join(sorted(new))}")
     if "Traceback" in said:
         problems.append(f"traceback: {said.strip().splitlines()[-1]}")
     if number != signal.SIGKILL and status != 0:
@@ -159,10 +167,14 @@ def resumed(outcome: Outcome, folder: Path) -> None:
 
 @dataclass(frozen=True)
 class Args:
-    """Interrupt short runs of the cube at several moments."""
+    """Interrupt short runs at several moments."""
 
     moments: tuple[float, ...] = (1.0, 5.0, 15.0, 30.0)
     """Times after the start of a run, or of its training [s]."""
+    env: str = "DoraCube-v1"
+    """Task of the runs."""
+    agent: str | None = None
+    """Their learner; the recommended one by default."""
     training: bool = False
     """Count the moments from the first iteration of training, which start-up delays by more or less."""
     signal: Literal["INT", "TERM", "KILL"] = "INT"
@@ -177,9 +189,10 @@ def main() -> int:
     """Run the command; returns the exit status."""
     args, wrong = tyro.cli(Args, description=__doc__), False
     number = getattr(signal, f"SIG{args.signal}")
+    options = (*SHORT, "--env", args.env, *(("--agent", args.agent) if args.agent else ()))
     for moment in args.moments:
         place = Path(tempfile.mkdtemp(prefix="interruptions-"))
-        outcome = judged(number, moment, place / "run", args.group, training=args.training)
+        outcome = judged(number, moment, place / "run", args.group, options, args.training)
         if args.resume:
             resumed(outcome, place / "run")
         print(outcome, flush=True)

@@ -42,6 +42,7 @@ from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.agents.seeds import seeds_for
 from dora.errors import RECORDS, InputError, WorkerFailure
+from dora.parallel import name_leftovers
 from dora.progress import ProgressDisplay
 
 RENAMED = {
@@ -81,6 +82,7 @@ class Trainer:
         zero: bool = True,
         cluster: bool = False,
     ):
+        name_leftovers()  # a replay buffer has semaphores
         self._others, self._looked = OtherLoad(), time.perf_counter()
         self.config, self.make_task, self.folder, self._zero, self._cluster = config, make_task, folder, zero, cluster
         torch.set_num_threads(config.learner_threads)
