@@ -1,6 +1,8 @@
 """How interrupted runs are judged: invented outcomes, and the words for what is wrong with them."""
 
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -88,3 +90,15 @@ def test_a_run_that_cannot_go_on_is_a_problem_if_it_had_begun(
     outcome = Outcome(5.0, 0.3, 2.0, 143, None, frozenset({str(left)}))
     resumed(outcome, tmp_path)
     assert outcome.problems == (["cannot be resumed: Nothing fits.", f"left for good: {left}"] if begun else [])
+
+
+def test_training_begins_with_the_first_row_of_its_table(tmp_path: Path):
+    table = tmp_path / "progress.csv"
+    write = (
+        "import sys, time; t = open(sys.argv[1], 'w', 1); print('a,b', file=t); time.sleep(0.5); print('1,2', file=t)"
+    )
+    with subprocess.Popen([sys.executable, "-c", f"{write}; time.sleep(60)", str(table)], text=True) as process:
+        interruptions.wait_for_rows(table, process)
+        assert table.read_text() == "a,b\n1,2\n"
+        process.kill()
+    interruptions.wait_for_rows(tmp_path / "nothing", process)  # it has ended

@@ -78,9 +78,9 @@ def command(*options: str) -> list[str]:
     return [sys.executable, "-m", "dora", "run", *options]
 
 
-def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
-    """Wait until a file exists, or the process that writes it has ended."""
-    while not path.exists() and process.poll() is None:
+def wait_for_rows(path: Path, process: subprocess.Popen[str]) -> None:
+    """Wait until a table has a row below its head, or the process that writes it has ended."""
+    while not (path.exists() and path.read_bytes().count(b"\n") > 1) and process.poll() is None:
         time.sleep(0.05)
 
 
@@ -92,9 +92,9 @@ def interrupt(
     Args:
         words: of the command line.
         number: of the signal.
-        moment: since the start, or since the file `after` exists [s].
+        moment: since the start, or since the table `after` has a row [s].
         group: send it to all processes of the command.
-        after: a file that the command writes.
+        after: a table that the command writes.
 
     Returns:
         Seconds to the first line after the signal, None without one; seconds to the end; exit status; what it said;
@@ -110,7 +110,7 @@ def interrupt(
     listener = threading.Thread(target=listen, daemon=True)
     listener.start()
     if after is not None:
-        wait_for(after, process)
+        wait_for_rows(after, process)
     time.sleep(moment)
     sent = time.monotonic()
     with contextlib.suppress(ProcessLookupError):  # it may have ended
