@@ -7,11 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import call
 from fake_run import fake_words
 from fake_sweep import fake, few, nothing, result, starts, states
 
 import dora.sweeps.sweep
 from dora.agents.runs.run_folder import RunFolder
+from dora.commands import sweep as command
 from dora.configs import plain
 from dora.errors import InputError
 from dora.sweeps import ray_cluster
@@ -173,3 +175,32 @@ def test_who_comes_second_waits_for_the_process_that_trains_in_a_folder(tmp_path
     os.close(lock)
     sweep.run(fake("well"), nothing, nothing)
     assert states(sweep) == [State.DONE]
+
+
+@pytest.mark.parametrize("evaluated", [False, True])
+def test_a_sweep_tells_how_to_get_the_zero_correction_that_a_failed_run_owes(
+    evaluated: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Of runs at the same time one evaluates it for all."""
+    row, out = few(1)[0], tmp_path / "a sweep"
+    result(row, out / row.name)
+    if evaluated:
+        (out / row.name / "zero.csv").touch()
+    monkeypatch.setattr(command, "_launcher", lambda args, sweep: fake("fails"))
+    words = (
+        "--env",
+        "DoraCube-v1",
+        "--agent",
+        "ppo",
+        "--guidance",
+        "affordance",
+        "--seeds",
+        "0",
+        "1",
+        "--retries",
+        "0",
+    )
+    assert call(command, monkeypatch, *words, "--out", str(out)) == command.FAILED
+    told = capsys.readouterr().err
+    expected = f"dora run --eval-only --checkpoint '{out / row.name}' --out '{out / 'zero' / row.name}' --episodes 500"
+    assert (f"{expected} --zero-correction" in told) is not evaluated

@@ -10,6 +10,7 @@ A finished run counts, whichever command made it, if its settings are the same a
 """
 
 import os
+import shlex
 import signal
 import sys
 from dataclasses import dataclass
@@ -93,6 +94,11 @@ def main() -> int:
             print(f"Interrupted and saved; {summary(sweep)}. The same command goes on.", file=sys.stderr)
             return STATUS + (interrupt.number or signal.SIGINT)
     print_all(sweep)
+    for entry in sweep.without_zero if sweep.count(State.FAILED) else ():
+        places = "--checkpoint", str(entry.folder), "--out", str(out / "zero" / entry.row.name)
+        options = shlex.join([*places, "--episodes", str(entry.row.config.final_episodes), "--zero-correction"])
+        told = f"{entry.row.name}: no zero correction, because the run failed that was to evaluate it; it is had by "
+        print(f"{told}dora run --eval-only {options}", file=sys.stderr)
     print(out)
     return FAILED if sweep.count(State.FAILED) else 0
 

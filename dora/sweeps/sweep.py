@@ -109,6 +109,18 @@ class Sweep:
         """Number of runs that stand so."""
         return sum(entry.state is state for entry in self.entries)
 
+    @property
+    def without_zero(self) -> list[Entry]:
+        """A finished run of each kind whose zero correction no finished run has, because the one that was to evaluate
+        it failed or has not ended."""
+        done = [e for e in self.entries if e.state is State.DONE and e.row.config.has_prior]
+        told = [e for e in done if (e.folder / "zero.csv").is_file()]
+        found = list[Entry]()
+        for entry in done:
+            if not any(entry.row.same_zero(other.row) for other in (*told, *found)):
+                found.append(entry)
+        return found
+
     def run(self, launcher: Launcher, tell: Callable[["Sweep"], None], check: Callable[[], None]) -> None:
         """Train until every run is finished or has failed too often.
 
