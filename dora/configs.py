@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import dacite
 
@@ -77,6 +77,8 @@ def _merged(values: dict[str, Any], changes: Mapping[str, Any], where: str) -> d
             raise InputError(f"{where} has no field {shown(str(name))}: {suggestion(name, values)}")
         if isinstance(value, bool) and not isinstance(values[name], bool | None):
             raise InputError(f"{where}.{name} must be a number or a text, not {value}.")
+        if isinstance(value, str) and isinstance(values[name], list):
+            raise InputError(f"{where}.{name} must be a list, not {shown(value)}.")
         if isinstance(values[name], dict) and isinstance(value, Mapping):
             merged[name] = _merged(values[name], value, f"{where}.{name}")
         else:
@@ -97,6 +99,9 @@ def _sentence(error: dacite.DaciteError) -> str:
     """What is wrong with a field, without a full stop."""
     if isinstance(error, dacite.WrongTypeError):
         wanted = getattr(error.field_type, "__name__", str(error.field_type))
+        if get_origin(error.field_type) is tuple and Ellipsis not in get_args(error.field_type):
+            kinds = ", ".join(getattr(kind, "__name__", str(kind)) for kind in get_args(error.field_type))
+            wanted = f"{len(get_args(error.field_type))} values ({kinds})"
         return f"{error.field_path} must be {wanted}, not {shown(error.value)}"
     return str(error).rstrip(".")
 

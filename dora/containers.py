@@ -36,6 +36,8 @@ MOST_NUMBERS = 10_000_000
 """Largest number of elements that the accessors and primitives of a glTF file declare [1]."""
 MOST_XML, MOST_REREAD = 350_000, 1_000_000
 """Largest number of elements in an XML file of a mesh, and in all files that components name, each time anew [1]."""
+HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_mesh_quantization")
+"""How extensions of glTF begin that change nothing that is read of a mesh, or are understood."""
 BINARY = re.compile(rb"[^\n]*\nformat binary_(little|big)_endian 1\.0\r?\n")
 """How a PLY file begins whose content is no text."""
 NAMES = {
@@ -178,9 +180,16 @@ def _check_gltf(path: Path, header: bytes) -> None:
     content = parse_json(header.decode("utf-8", "replace"), f"the header of {path}")
     if not isinstance(content, dict):
         raise InputError(f"{path} has no glTF header: export it again.")
-    counts = [_whole(accessor.get("count")) for accessor in _tables(content.get("accessors"))]
+    needed = [name for name in _list(content.get("extensionsRequired")) if not str(name).startswith(HARMLESS)]
+    if needed:
+        raise InputError(f"{path} needs {shown(needed[0])}, which is not read here: export it without compression.")
+    accessors = _tables(content.get("accessors"))
+    counts = [_whole(accessor.get("count")) for accessor in accessors]
     primitives = [each for mesh in _tables(content.get("meshes")) for each in _tables(mesh.get("primitives"))]
     used = [_whole(n) for each in primitives for n in (each.get("indices"), *_values(each.get("attributes")))]
+    shaped = [accessors[n] for each in primitives if (n := _position(each)) < len(accessors)]
+    if any(accessor.get("normalized") for accessor in shaped):
+        raise InputError(f"{path} has coordinates as normalised integers: export it without quantisation.")
     declared = sum(counts) + sum(counts[n] for n in used if n < len(counts))
     if declared > MOST_NUMBERS:
         raise InputError(f"{path} declares {declared} numbers; it may have at most {MOST_NUMBERS}: reduce the mesh.")
@@ -302,6 +311,12 @@ def _tables(value: Any) -> list[dict[str, Any]]:
 
 def _values(value: Any) -> list[Any]:
     return list(value.values()) if isinstance(value, dict) else []
+
+
+def _position(primitive: dict[str, Any]) -> int:
+    """Index of the accessor with the coordinates of a glTF primitive."""
+    attributes = primitive.get("attributes")
+    return _whole(attributes.get("POSITION")) if isinstance(attributes, dict) else 0
 
 
 def _whole(value: Any) -> int:

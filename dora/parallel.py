@@ -8,6 +8,7 @@ import platform
 import re
 import shutil
 import signal
+import sys
 import tempfile
 import threading
 import time
@@ -31,7 +32,7 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
-from dora.errors import WorkerFailure
+from dora.errors import InputError, WorkerFailure
 
 Case = TypeVar("Case")
 Result = TypeVar("Result")
@@ -50,6 +51,8 @@ SHARED = Path("/dev/shm")
 """Where the system keeps semaphores by name."""
 LEFT = re.compile(r"(?:sem\.mp-)?dora-(?P<space>\d+)-(?P<process>\d+)-(?P<start>\d+)-.*")
 """Name of a semaphore or temporary folder with the process that made it, see `name_of_process`."""
+LONGEST_SOCKET = 103 if sys.platform == "darwin" else 107
+"""Bytes of the longest path of a socket."""
 BESIDE = 50
 """Characters of a target's name in that of the folder beside it; names have at most 255 bytes."""
 DIED = "A worker process died (a crash in native code, or too little memory): run with one process to see why."
@@ -206,12 +209,22 @@ def name_leftovers() -> None:
         return  # a worker uses the names of the process that started it
     settings: dict[str, str] = current_process()._config  # pyright: ignore[reportAttributeAccessIssue]
     settings["semprefix"] = f"/mp-{name_of_process().rstrip('-')}"
-    settings["tempdir"] = folder = tempfile.mkdtemp(prefix=name_of_process())
+    settings["tempdir"] = folder = tempfile.mkdtemp(prefix=name_of_process(), dir=_place_of_sockets())
     Finalize(None, shutil.rmtree, (folder,), {"ignore_errors": True}, exitpriority=-100)
-    for place in (SHARED, Path(tempfile.gettempdir())):
+    for place in {SHARED, Path(tempfile.gettempdir()), Path(folder).parent}:
         for path in place.glob("*dora-*-*"):
             if _is_left(path):
                 shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def _place_of_sockets() -> str:
+    """Where this process may have a folder with the sockets of its workers, whose paths must not be long."""
+    places = [os.path.abspath(tempfile.gettempdir()), "/tmp", "/var/tmp", "/dev/shm"]
+    room = LONGEST_SOCKET - len(name_of_process()) - len("/xxxxxxxx/listener-xxxxxxxx")
+    for place in places:
+        if len(os.fsencode(place)) <= room and os.access(place, os.W_OK | os.X_OK):
+            return place
+    raise InputError(f"the path of temporary files, {places[0]}, is too long for sockets: set TMPDIR to a shorter one.")
 
 
 def folder_beside(target: Path) -> Path:

@@ -11,6 +11,8 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 LINE_SECONDS = 10.0
 """Time between two plain lines [s]."""
+SILENT_SECONDS = 5.0
+"""Time after which something that is mostly quick begins to tell how far it is [s]."""
 
 
 class ProgressDisplay:
@@ -74,3 +76,18 @@ class ProgressDisplay:
     def say(self, text: str) -> None:
         """Print one line above the bars."""
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def slow_phase(name: str, unit: str) -> Callable[[int, int], None]:
+    """Plain lines about something that is mostly quick, from the time on when it is not; beside bars of others, too.
+
+    Args:
+        name: what is being done.
+        unit: what is counted, in the plural.
+
+    Returns:
+        What is to be called with (done, total) now and then.
+    """
+    report = ProgressDisplay(Console(stderr=True, force_terminal=False)).phase(name, unit)
+    start = time.monotonic()
+    return lambda done, total: report(done, total) if time.monotonic() - start > SILENT_SECONDS else None

@@ -5,6 +5,7 @@ import struct
 import zipfile
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ MESH: dict[str, Any] = {
                   {"count": 300_000, "componentType": 5125, "type": "SCALAR"}],
 }  # fmt: skip
 """A glTF file of 100,000 triangles without any data."""
+NORMALISED = MESH | {"accessors": [{"count": 3, "componentType": 5122, "type": "VEC3", "normalized": True}]}
 MESH_OF_60 = [{"primitives": [{"attributes": {"POSITION": 0}}] * 60}]
 """A mesh of many parts, each of a hundred triangles."""
 FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
@@ -62,6 +64,13 @@ def test_huge_meshes_are_refused_by_their_size(tmp_path: Path, name: str):
         (MESH | {"nodes": [*({"children": [i + 1]} for i in range(101)), {"mesh": 0}]}, "100 levels deep"),
         (b'{"a":' + b"[" * 100_000, "not valid JSON"),
         ([], "no glTF header"),
+        (
+            MESH | {"extensionsRequired": ["KHR_draco_mesh_compression"]},
+            "which is not read here",
+        ),
+        (MESH | {"extensionsRequired": ["KHR_mesh_quantization", "EXT_meshopt_compression"]}, "without compression"),
+        (MESH | {"extensionsRequired": [5]}, "needs 5, which is not read here"),
+        (NORMALISED, "coordinates as normalised integers"),
     ],
 )
 def test_gltf(tmp_path: Path, header: Any, words: str):
@@ -204,3 +213,19 @@ def test_many_loose_triangles(tmp_path: Path):
 def test_faces_out_of_range(tmp_path: Path, content: str, words: str):
     with refused(words):
         read_mesh(written(tmp_path / "a.obj", content))
+
+
+@pytest.mark.parametrize("name", ["my mug", "把手", "100%25"])
+def test_files_that_a_gltf_names_may_be_encoded_as_its_format_demands(tmp_path: Path, name: str):
+    files = trimesh.Scene(trimesh.creation.box((0.05, 0.06, 0.07))).export(file_type="gltf")
+    assert isinstance(files, dict)
+    content = json.loads(files.pop("model.gltf"))
+    for buffer in content["buffers"]:
+        (tmp_path / f"{name} {buffer['uri']}").write_bytes(files[buffer["uri"]])
+        buffer["uri"] = quote(f"{name} {buffer['uri']}")
+    mesh, _ = read_mesh(written(tmp_path / "a.gltf", json.dumps(content)))
+    np.testing.assert_allclose(sorted(mesh.extents), (0.05, 0.06, 0.07))
+    content["buffers"][0]["uri"] = "%2e%2e/" + content["buffers"][0]["uri"]
+    (tmp_path / "below").mkdir()
+    with refused("does not lie beside it"):
+        read_mesh(written(tmp_path / "below" / "a.gltf", json.dumps(content)))

@@ -116,6 +116,17 @@ def test_the_interquartile_mean_leaves_out_the_extremes():
     assert around[0] < 0.5 < around[1]
 
 
+def test_intervals_over_tasks_are_the_same_each_time_and_leave_other_draws_alone():
+    pytest.importorskip("rliable.library")
+    scores = {"a": np.random.default_rng(0).uniform(size=(3, 4))}
+    np.random.seed(5)  # noqa: NPY002
+    expected = np.random.uniform()  # noqa: NPY002
+    np.random.seed(5)  # noqa: NPY002
+    found = aggregates(scores)
+    assert np.random.uniform() == expected  # noqa: NPY002
+    assert aggregates(scores) == found
+
+
 def test_without_rliable_a_report_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def missing(name: str) -> object:
         raise ImportError(name)

@@ -108,7 +108,8 @@ def test_a_number_that_was_chosen_stays_under_another_preset():
         ({"length": "far"}, "length must be float, not 'far'"),
         ({"count": 1.5}, "count must be int, not 1.5"),
         ({"count": True}, "count"),
-        ({"both": [1.0]}, "both"),
+        ({"both": [1.0]}, "both must be 2 values (float, float), not (1.0,)"),
+        ({"both": "ab"}, "config.both must be a list, not 'ab'"),
         ({"inner": 3}, "inner"),
         ([("length", 1.0)], "mapping"),
     ],
@@ -195,6 +196,8 @@ def test_a_preset_brings_other_numbers_of_a_task_too():
         ({"arm_effort": 1.5}, "config.arm_effort is 1.5 and has to be from 0.01 to 1"),
         ({"physics_frequency": 110}, "multiple of config.control_frequency, 20 Hz"),
         ({"lift": None}, "lift must be float"),
+        ({"definition": 0}, "config.definition is 0 and has to be from 1"),
+        ({"definition": 99}, "config.definition is 99 and has to be from 1"),
     ],
 )
 def test_numbers_that_cannot_be_built_are_refused(changes: dict, words: str):

@@ -1,8 +1,9 @@
 """Recorded episodes are played as they were recorded, and files that are none are refused in one sentence."""
 
+import contextlib
 import json
-import re
 import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,15 @@ import h5py
 import numpy as np
 import pytest
 from live import Watched
+from mani_skill.trajectory.merge_trajectory import merge_trajectories
 
 from dora.datasets.episodes import Plan
 from dora.datasets.record import record_dataset
 from dora.datasets.sources import find_source
-from dora.digests import SEAL
 from dora.errors import InputError
 from dora.live.orders import Choose, Play, Randomise, Start
 from dora.live.players import ZERO, recorded, zero_correction
-from dora.live.recordings import TRAJECTORIES, Recording
+from dora.live.recordings import Recording, seal
 
 
 @pytest.fixture(scope="module")
@@ -65,11 +66,10 @@ def test_an_episode_begins_in_its_recorded_state_whatever_its_seed(recording: Pa
 
 
 def damaged(path: Path, folder: Path, how: str) -> Path:
-    """A copy of a recording with something wrong, and without the digests that would tell."""
+    """A copy of a recording with something wrong, and without the checksums that would tell."""
     copy = folder / "copy.h5"
     shutil.copy(path, copy)
     index = json.loads(path.with_suffix(".json").read_text())
-    index = {name: value for name, value in index.items() if name not in (SEAL, TRAJECTORIES)}
     if how == "stock":
         index["env_info"]["env_id"] = "PickCube-v1"
     elif how == "empty":
@@ -120,21 +120,44 @@ def test_a_file_that_is_no_recording_is_refused(recording: Path, tmp_path: Path,
         Recording.open(path).episode(0)
 
 
-@pytest.mark.parametrize("changed", ["copy.h5", "copy.json"])
-@pytest.mark.parametrize("place", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("changed", ["h5", "json", "sha256"])
+@pytest.mark.parametrize("place", [0.0, 0.2, 0.5, 0.8])
 def test_any_change_of_a_recording_of_ours_is_found(recording: Path, tmp_path: Path, changed: str, place: float):
-    for end in (".h5", ".json"):
-        shutil.copy(recording.with_suffix(end), tmp_path / f"copy{end}")
-    copy = tmp_path / "copy.h5"
+    for end in (".h5", ".json", ".sha256"):
+        shutil.copy(recording.with_suffix(end), tmp_path)
+    copy = tmp_path / recording.name
     assert len(Recording.open(copy).episode(0).actions)
-    content = bytearray((tmp_path / changed).read_bytes())
-    at = int(place * len(content))
-    if changed.endswith("json"):
-        at = re.compile(rb"(?<=[\d.])\d").search(content, at).start()  # pyright: ignore[reportOptionalMemberAccess]
-    content[at] ^= 1
-    (tmp_path / changed).write_bytes(content)
-    with pytest.raises(InputError, match=rf"{changed} was damaged or changed after it was written: record it again"):
+    file = copy.with_suffix(f".{changed}")
+    content = bytearray(file.read_bytes())
+    content[int(place * len(content))] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(
+        InputError, match=r"is not as it was written, .* remove demonstrations.sha256 to play it as it is"
+    ):
         Recording.open(copy)
+    copy.with_suffix(".sha256").unlink()
+    with contextlib.suppress(InputError):
+        Recording.open(copy)
+
+
+def test_recordings_that_maniskill_joined_can_be_played(recording: Path, tmp_path: Path):
+    merge_trajectories(str(tmp_path / "merged.h5"), [str(recording), str(recording)])
+    merged = Recording.open(tmp_path / "merged.h5")
+    assert len(merged.names) == 4
+    np.testing.assert_array_equal(merged.episode(2).actions, Recording.open(recording).episode(0).actions)
+
+
+@pytest.mark.skipif(shutil.which("sha256sum") is None, reason="needs sha256sum")
+def test_the_checksums_are_those_of_sha256sum(recording: Path):
+    words = ["sha256sum", "--check", "--strict", "demonstrations.sha256"]
+    assert subprocess.run(words, cwd=recording.parent, capture_output=True).returncode == 0
+
+
+def test_an_index_of_any_size_gets_checksums(tmp_path: Path):
+    (tmp_path / "large.h5").write_bytes(b"any")
+    (tmp_path / "large.json").write_bytes(b" " * 10_000_000)
+    seal(tmp_path / "large.h5")
+    assert len((tmp_path / "large.sha256").read_text().splitlines()) == 2
 
 
 def test_a_missing_file_is_refused(tmp_path: Path):

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from dora import progress
-from dora.progress import ProgressDisplay
+from dora.progress import ProgressDisplay, slow_phase
 
 
 @pytest.fixture
@@ -43,3 +43,22 @@ def test_on_a_terminal_there_is_a_bar_instead():
     assert "search" in text.getvalue()
     assert "100%" in text.getvalue()
     assert "120/120" not in text.getvalue()
+
+
+def test_what_is_quick_is_not_told(clock: list[float], capsys: pytest.CaptureFixture[str]):
+    report = slow_phase("a table", "places")
+    for seconds, done in ((0.1, 10), (4.9, 40), (6.0, 60), (7.0, 70), (16.5, 90)):
+        clock.append(100.0 + seconds)
+        report(done, 100)
+    assert capsys.readouterr().err.splitlines() == [
+        "a table: 60/100, 10 places/s, ETA 4 s",
+        "a table: 90/100, 5.45 places/s, ETA 2 s",
+    ]
+
+
+def test_what_is_slow_is_told_beside_a_bar_of_something_else(clock: list[float], capsys: pytest.CaptureFixture[str]):
+    with ProgressDisplay(Console(file=io.StringIO(), force_terminal=True)):
+        report = slow_phase("a table", "places")
+        clock.append(106.0)
+        report(60, 100)
+    assert "a table: 60/100" in capsys.readouterr().err

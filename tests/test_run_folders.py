@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -197,6 +198,31 @@ if __name__ == "__main__":
     print(name_of_process(), flush=True)
     os.killpg(0, signal.SIGKILL)
 """
+
+
+DOUBLING = """
+from dora.parallel import name_leftovers, run_cases
+def doubler():
+    return lambda number: 2 * number
+if __name__ == "__main__":
+    from multiprocessing import get_context
+    print(run_cases(doubler, (), [1, 2, 3], 2, chunk=1))
+    queue = get_context("spawn").Manager().Queue()
+    queue.put(8)
+    print(queue.get())
+"""
+
+
+@pytest.mark.parametrize("length", [60, pytest.param(200, marks=pytest.mark.slow)])
+def test_workers_begin_whatever_the_length_of_the_path_of_temporary_files(tmp_path: Path, length: int):
+    script, folder = tmp_path / "doubling.py", Path(f"/tmp/{'x' * (length - 5)}")
+    script.write_text(DOUBLING)
+    folder.mkdir(exist_ok=True)
+    words, env = [sys.executable, str(script)], os.environ | {"TMPDIR": str(folder)}
+    done = subprocess.run(words, capture_output=True, text=True, env=env, timeout=120)
+    assert done.stdout.splitlines() == ["[2, 4, 6]", "8"], done.stderr
+    assert not any(folder.iterdir())
+    folder.rmdir()
 
 
 TRAINING = """

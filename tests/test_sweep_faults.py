@@ -177,15 +177,16 @@ def test_who_comes_second_waits_for_the_process_that_trains_in_a_folder(tmp_path
     assert states(sweep) == [State.DONE]
 
 
-@pytest.mark.parametrize("evaluated", [False, True])
+@pytest.mark.parametrize("evaluated", ["", ".", "zero"])
 def test_a_sweep_tells_how_to_get_the_zero_correction_that_a_failed_run_owes(
-    evaluated: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    evaluated: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """Of runs at the same time one evaluates it for all."""
     row, out = few(1)[0], tmp_path / "a sweep"
     result(row, out / row.name)
     if evaluated:
-        (out / row.name / "zero.csv").touch()
+        (out / evaluated / row.name).mkdir(parents=True, exist_ok=True)
+        (out / evaluated / row.name / "zero.csv").touch()
     monkeypatch.setattr(command, "_launcher", lambda args, sweep: fake("fails"))
     words = (
         "--env",
@@ -203,4 +204,4 @@ def test_a_sweep_tells_how_to_get_the_zero_correction_that_a_failed_run_owes(
     assert call(command, monkeypatch, *words, "--out", str(out)) == command.FAILED
     told = capsys.readouterr().err
     expected = f"dora run --eval-only --checkpoint '{out / row.name}' --out '{out / 'zero' / row.name}' --episodes 500"
-    assert (f"{expected} --zero-correction" in told) is not evaluated
+    assert (f"{expected} --zero-correction" in told) is not bool(evaluated)

@@ -38,7 +38,7 @@ class Args:
     """Which runs, and where they are trained."""
 
     preset: Literal["paper", "quick"] = "paper"
-    """paper: the runs of the paper's tables I, III and IV and of the ladder of guidance. quick: every task, guided and
+    """paper: the runs of the paper's tables II, III and IV and of the ladder of guidance. quick: every task, guided and
     unguided, in minutes, to see that all of it works."""
     out: Path | None = None
     """Folder of the sweep: a run folder for each run (default runs/sweep-<preset>)."""
@@ -95,7 +95,7 @@ def main() -> int:
             return STATUS + (interrupt.number or signal.SIGINT)
     print_all(sweep)
     for entry in sweep.without_zero if sweep.count(State.FAILED) else ():
-        places = "--checkpoint", str(entry.folder), "--out", str(out / "zero" / entry.row.name)
+        places = "--checkpoint", str(entry.folder), "--out", str(sweep.zero_folder(entry))
         options = shlex.join([*places, "--episodes", str(entry.row.config.final_episodes), "--zero-correction"])
         told = f"{entry.row.name}: no zero correction, because the run failed that was to evaluate it; it is had by "
         print(f"{told}dora run --eval-only {options}", file=sys.stderr)

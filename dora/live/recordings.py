@@ -15,10 +15,8 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
-from dora.digests import SEAL, is_whole, sealed
 from dora.errors import InputError, shown
-from dora.files import write_json
-from dora.reading import check_size, read_json
+from dora.reading import check_size, read_bytes, read_json
 from dora.tasks import check_task_id
 
 MOST_BYTES = 4_000_000_000
@@ -35,8 +33,10 @@ KEPT = ("guidance", "guidance_parts", "hand_joints", "preset", "config", "contro
 """Arguments of a task that say what its actions and states mean; the others are of the machine that recorded."""
 PREFIX = "dora:"
 """What our ids begin with in a recording."""
-TRAJECTORIES = "trajectories_digest"
-"""Entry of an index with the sha256 of the trajectory file beside it."""
+SUMS = ".sha256"
+"""Ending of the file with the checksums of a trajectory file and of its index, which lies beside them."""
+MOST_SUMS = 10_000
+"""Largest size of it [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +81,12 @@ class Recording:
         index_path = path.with_suffix(".json")
         if not os.path.isfile(index_path):
             raise InputError(f"{index_path} is missing: the index of a recording has to lie beside {path.name}.")
+        _check_whole(path)
         index = read_json(index_path, "index of a recording")
         info = index.get("env_info") if isinstance(index, dict) else None
         episodes = index.get("episodes") if isinstance(index, dict) else None
         if not isinstance(info, dict) or not isinstance(episodes, list) or not isinstance(info.get("env_id"), str):
             raise InputError(f"{index_path} is no index of a ManiSkill recording: name the .h5 file of one.")
-        _check_whole(path, index)
         env_id = info["env_id"].removeprefix(PREFIX)
         check_task_id(env_id)
         kwargs: Any = info.get("env_kwargs")
@@ -118,7 +118,7 @@ class Recording:
 
 
 def seal(path: Path) -> None:
-    """Write both digests into the index of a recording.
+    """Write the checksums of a recording beside it, as `sha256sum` writes them.
 
     Args:
         path: of the trajectory file (HDF5), with its index (JSON) beside it.
@@ -126,38 +126,37 @@ def seal(path: Path) -> None:
     Raises:
         OSError: a file cannot be read or written.
     """
-    index = path.with_suffix(".json")
-    write_json(index, sealed(read_json(index, "index of a recording") | {TRAJECTORIES: _sha256(path)}))
+    lines = (f"{_sha256(file)}  {file.name}\n" for file in (path, path.with_suffix(".json")))
+    path.with_suffix(SUMS).write_text("".join(lines))
 
 
-def _check_whole(path: Path, index: Mapping[str, Any]) -> None:
-    """Refuse a recording that is no longer as `seal` left it; one without digests, of another program, passes.
+def _check_whole(path: Path) -> None:
+    """Refuse a recording that is no longer as `seal` left it; one without checksums, of another program, passes.
 
     Args:
         path: of the trajectory file.
-        index: what its index holds.
 
     Raises:
-        InputError: a file was damaged or changed.
-        OSError: the trajectory file cannot be read.
+        InputError: a file was damaged or changed, or cannot be read.
     """
-    if SEAL not in index and TRAJECTORIES not in index:
+    sums = path.with_suffix(SUMS)
+    if not os.path.lexists(sums):
         return
-    changed = None
-    if not is_whole(index):
-        changed = path.with_suffix(".json")
-    elif index.get(TRAJECTORIES) != _sha256(path):
-        changed = path
-    if changed is not None:
-        raise InputError(
-            f"{changed} was damaged or changed after it was written: record it again, or remove {SEAL} and "
-            f"{TRAJECTORIES} from the index to play it as it is."
-        )
+    lines = read_bytes(sums, "file of checksums", MOST_SUMS).decode("utf-8", "replace").splitlines()
+    for file in (path, path.with_suffix(".json")):
+        if f"{_sha256(file)}  {file.name}" not in lines:
+            raise InputError(
+                f"{file} is not as it was written, by its checksum in {sums.name}: record it again, or remove "
+                f"{sums.name} to play it as it is."
+            )
 
 
 def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"Cannot read {path} ({error.strerror or error}): give the path of a recording.") from error
 
 
 def _named(episode: Any, path: Path) -> tuple[str, int]:

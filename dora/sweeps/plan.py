@@ -65,7 +65,7 @@ QUICK_STEPS = 20_000
 PRESETS = {
     "paper": Preset(
         (
-            Block("Table I", ONE_ARM, ("ppo", "sac"), (AFFORDANCE, NONE)),
+            Block("Table II", ONE_ARM, ("ppo", "sac"), (AFFORDANCE, NONE)),
             Block("Table IV", TWO_ARMS, ("happo", "mappo"), (AFFORDANCE, NONE)),
             Block("ladder", WITH_ANY_REGION, (None,), (GRASPS,)),
             Block("ladder", ONE_ARM, (None,), (PAPERS,)),

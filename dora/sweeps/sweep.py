@@ -114,12 +114,16 @@ class Sweep:
         """A finished run of each kind whose zero correction no finished run has, because the one that was to evaluate
         it failed or has not ended."""
         done = [e for e in self.entries if e.state is State.DONE and e.row.config.has_prior]
-        told = [e for e in done if (e.folder / "zero.csv").is_file()]
+        told = [e for e in done if any((path / "zero.csv").is_file() for path in (e.folder, self.zero_folder(e)))]
         found = list[Entry]()
         for entry in done:
             if not any(entry.row.same_zero(other.row) for other in (*told, *found)):
                 found.append(entry)
         return found
+
+    def zero_folder(self, entry: Entry) -> Path:
+        """Where zero correction of a run may be evaluated later on."""
+        return self.out / "zero" / entry.row.name
 
     def run(self, launcher: Launcher, tell: Callable[["Sweep"], None], check: Callable[[], None]) -> None:
         """Train until every run is finished or has failed too often.

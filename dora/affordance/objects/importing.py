@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
+from urllib.parse import unquote
 
 import numpy as np
 import trimesh
@@ -195,7 +197,8 @@ class _Neighbours(FilePathResolver):
 
     def get(self, name: str) -> bytes:
         folder = Path(str(self.parent)).resolve()
-        path = (folder / name.strip()).resolve()
+        plain = folder / name.strip()
+        path = (plain if os.path.lexists(plain) else folder / unquote(name.strip())).resolve()  # glTF encodes names
         if not path.is_relative_to(folder):
             raise InputError(f"it names the file {shown(name)}, which does not lie beside it")
         return without_mark(read_bytes(path, "file that a mesh names", MOST_BYTES))

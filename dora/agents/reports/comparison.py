@@ -119,7 +119,7 @@ def _success(cells: Mapping[Cell, list[Run]]) -> Section:
         "In brackets the bootstrap interval over seeds and starts, where the episodes of all runs are there. "
         "With three seeds that differ it is too narrow: it covers the true mean in about 85 to 90 of 100 cases."
     )
-    return Section("Overall success beside the paper's tables I and IV", head, rows, note)
+    return Section("Overall success beside the paper's tables II and IV", head, rows, note)
 
 
 def _minutes(cells: Mapping[Cell, list[Run]]) -> Section:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Printed:
-    """A cell of the paper's tables I, III or IV.
+    """A cell of the paper's tables II, III or IV.
 
     Attributes:
         success: overall success rate [%].
@@ -38,7 +38,7 @@ PAPER: dict[Cell, Printed] = {
     ("DoraMicrowave-v1", "HAPPO", "affordance"): Printed(68.1, 1.0),
     ("DoraMicrowave-v1", "MAPPO", "affordance"): Printed(55.0, 0.3),
 }
-"""Tables I (tasks 1 to 3), III (minutes) and IV (task 4)."""
+"""Tables II (tasks 1 to 3), III (minutes) and IV (task 4)."""
 ONE_ARM = ("DoraCube-v1", "DoraJug-v1", "DoraHammer-v1")
 """Tasks 1 to 3."""
 BETTER = {"DoraCube-v1": "PPO", "DoraJug-v1": "PPO", "DoraHammer-v1": "SAC"}

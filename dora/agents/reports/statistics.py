@@ -88,10 +88,14 @@ def aggregates(
     def both(x: np.ndarray) -> np.ndarray:
         return np.array([metrics.aggregate_mean(x), metrics.aggregate_iqm(x)])
 
-    random = np.random.RandomState(SEED)  # what rliable takes
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # of what rliable calls
-        points, intervals = library.get_interval_estimates(dict(scores), both, reps=SAMPLES, random_state=random)
+    before = np.random.get_state()  # noqa: NPY002  rliable draws from the global generator, whatever it is given
+    try:
+        np.random.seed(SEED)  # noqa: NPY002
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # of what rliable calls
+            points, intervals = library.get_interval_estimates(dict(scores), both, reps=SAMPLES)
+    finally:
+        np.random.set_state(before)  # noqa: NPY002
     return {
         name: [
             (float(p), (float(low), float(high))) for p, low, high in zip(points[name], *intervals[name], strict=True)

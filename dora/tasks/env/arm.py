@@ -14,6 +14,7 @@ from dora.affordance.reach.approach_paths import ReachSettings
 from dora.affordance.reach.feasibility import Reach
 from dora.affordance.reach.feasibility_table import Grid, ReachTable
 from dora.geometry.poses import Pose, compose
+from dora.progress import slow_phase
 from dora.robot.motion.controller_rollout import Controller
 from dora.sim.robot_agent import DescribedRobot
 from dora.tasks.guidance.guide import Guide
@@ -193,4 +194,6 @@ def tabulated_reach(arm: Arm, grid: Grid, candidates: GraspCandidates) -> ReachT
         ),
         start=start_posture(arm.spec),
     )
-    return ReachTable.of(reach, candidates.to("cpu"), grid, obj.support, obj.rest).to(arm.agent.device)
+    told = slow_phase(f"what the arm can reach of {obj.name}, stored for later", "places")
+    table = ReachTable.of(reach, candidates.to("cpu"), grid, obj.support, obj.rest, progress=told)
+    return table.to(arm.agent.device)

@@ -75,6 +75,7 @@ def task_config(cls: type[TaskConfig], preset: str, changes: Any, sim_config: An
     if not 0 <= low <= high:
         raise InputError(f"config.randomisation.friction is {low, high}; it has to be a lowest and a highest value.")
     check_ranges(config, RATES, lambda name: f"config.{name}")
+    check_ranges(config, {"definition": (1, cls().definition)}, lambda name: f"config.{name}")
     check_ranges(config.randomisation, {"delay": (0, MOST_DELAY)}, lambda name: f"config.randomisation.{name}")
     if config.physics_frequency % config.control_frequency:
         raise InputError(
