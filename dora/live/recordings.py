@@ -124,10 +124,10 @@ def seal(path: Path) -> None:
         path: of the trajectory file (HDF5), with its index (JSON) beside it.
 
     Raises:
-        OSError: a file cannot be read or written.
+        InputError: a file cannot be read.
+        OSError: the checksums cannot be written.
     """
-    lines = (f"{_sha256(file)}  {file.name}\n" for file in (path, path.with_suffix(".json")))
-    path.with_suffix(SUMS).write_text("".join(lines))
+    path.with_suffix(SUMS).write_bytes(os.fsencode(_sums(path)))
 
 
 def _check_whole(path: Path) -> None:
@@ -142,13 +142,20 @@ def _check_whole(path: Path) -> None:
     sums = path.with_suffix(SUMS)
     if not os.path.lexists(sums):
         return
-    lines = read_bytes(sums, "file of checksums", MOST_SUMS).decode("utf-8", "replace").splitlines()
-    for file in (path, path.with_suffix(".json")):
-        if f"{_sha256(file)}  {file.name}" not in lines:
-            raise InputError(
-                f"{file} is not as it was written, by its checksum in {sums.name}: record it again, or remove "
-                f"{sums.name} to play it as it is."
-            )
+    found, expected = read_bytes(sums, "file of checksums", MOST_SUMS), _sums(path)
+    if found == os.fsencode(expected):
+        return
+    lines = os.fsdecode(found).splitlines()
+    changed = [line.split("  ", 1)[1] for line in expected.splitlines() if line not in lines]
+    raise InputError(
+        f"{path.with_name(changed[0]) if changed else sums} is not as it was written, by its checksum in {sums.name}: "
+        f"record it again, or remove {sums.name} to play it as it is."
+    )
+
+
+def _sums(path: Path) -> str:
+    """A line for each file of a recording, as of `sha256sum`."""
+    return "".join(f"{_sha256(file)}  {file.name}\n" for file in (path, path.with_suffix(".json")))
 
 
 def _sha256(path: Path) -> str:
