@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from dora import quiet_start
-from dora.errors import BAD_INPUT, ManiSkillMissingError, suggestion
+from dora.errors import BAD_INPUT, LibraryMissingError, ManiSkillMissingError, naming_libraries, suggestion
 from dora.version import version_line
 
 COMMANDS = {
@@ -77,7 +77,7 @@ def main(words: Sequence[str] | None = None, around: Callable[[Callable[[], int]
     sys.argv = [f"dora {first}", *rest]
     try:
         body = _body(first)
-    except ManiSkillMissingError as error:
+    except (LibraryMissingError, ManiSkillMissingError) as error:
         print(error, file=sys.stderr)
         return BAD_INPUT
     return around(body)
@@ -85,8 +85,9 @@ def main(words: Sequence[str] | None = None, around: Callable[[Callable[[], int]
 
 def _body(name: str) -> Callable[[], int]:
     """What does the work of a command; importing it takes seconds."""
-    importlib.import_module("dora.registration")
-    return importlib.import_module(f"dora.commands.{name}").main
+    with naming_libraries():
+        importlib.import_module("dora.registration")
+        return importlib.import_module(f"dora.commands.{name}").main
 
 
 def _complete(rest: Sequence[str]) -> int:

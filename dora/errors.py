@@ -1,10 +1,11 @@
 """The exceptions that Dora raises for what people can correct, and for runs that fail; values and hints in messages."""
 
+import contextlib
 import difflib
 import functools
 import reprlib
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, ParamSpec
 
 RECORDS = "DORA_NONFINITE"
@@ -48,6 +49,27 @@ class ManiSkillMissingError(ModuleNotFoundError):
             "Python 3.13, where mplib 0.1.1, which it asks for and Dora does not use, has no wheel).",
             name="mani_skill",
         )
+
+
+class LibraryMissingError(ImportError):
+    """A library of the system is missing: the message says how to add it. Commands print it without a traceback."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(
+            f"A library of the system is missing ({one_line(reason)}): SAPIEN and OpenCV load some that a bare machine "
+            "lacks; on Debian and Ubuntu `apt-get install libgl1 libx11-6 libglib2.0-0` adds them."
+        )
+
+
+@contextlib.contextmanager
+def naming_libraries() -> Iterator[None]:
+    """Imports whose errors are `LibraryMissingError` where a library of the system is missing."""
+    try:
+        yield
+    except ImportError as error:
+        if "cannot open shared object file" in str(error) and not isinstance(error, LibraryMissingError):
+            raise LibraryMissingError(str(error)) from error
+        raise
 
 
 class RunFailure(RuntimeError):

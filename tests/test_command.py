@@ -1,5 +1,6 @@
 """The command `dora`: help at once, one word per command, completion, and registration when it is needed."""
 
+import importlib
 import os
 import re
 import resource
@@ -208,6 +209,24 @@ def test_without_maniskill_one_sentence_says_how_to_add_it(tmp_path: Path):
     assert call.stderr.count("\n") == 1
     imported = run(sys.executable, "-c", f"{code} import dora")
     assert "ManiSkillMissingError: ManiSkill is not installed" in imported.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize(("module", "command"), [("sapien", "run"), ("viser", "view")])
+def test_without_a_library_of_the_system_one_sentence_says_how_to_add_it(tmp_path: Path, module: str, command: str):
+    reason = "libX11.so.6: cannot open shared object file: No such file or directory"
+    (tmp_path / f"{module}.py").write_text(f"raise ImportError({reason!r})")
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); "
+    (tmp_path / "dora").write_text(f"{code} from dora.__main__ import start; sys.exit(start([{command!r}, 'cube']))")
+    call = run(sys.executable, str(tmp_path / "dora"))
+    assert call.returncode == errors.BAD_INPUT
+    assert call.stderr.splitlines()[-1].startswith(f"A library of the system is missing ({reason})")
+    assert "apt-get install libgl1" in call.stderr
+    assert "Traceback" not in call.stderr
+
+
+def test_a_module_that_is_missing_is_no_library_of_the_system():
+    with pytest.raises(ModuleNotFoundError, match="nothing_of_the_kind"), errors.naming_libraries():
+        importlib.import_module("nothing_of_the_kind")
 
 
 @pytest.fixture(scope="module")
