@@ -12,10 +12,8 @@ from dora.errors import ManiSkillMissingError, naming_libraries
 if importlib.util.find_spec("mani_skill") is None:
     raise ManiSkillMissingError()
 
-with (
-    naming_libraries(),
-    warnings.catch_warnings(),
-):  # SAPIEN takes its own Vulkan loader then; whether there is a driver is said when asked
+with naming_libraries(), warnings.catch_warnings():
+    # SAPIEN takes its own Vulkan loader then; whether there is a driver is said when asked
     warnings.filterwarnings("ignore", "Failed to find system libvulkan", UserWarning)
     import mani_skill.envs as _stock_tasks  # noqa: F401
 

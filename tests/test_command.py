@@ -211,12 +211,12 @@ def test_without_maniskill_one_sentence_says_how_to_add_it(tmp_path: Path):
     assert "ManiSkillMissingError: ManiSkill is not installed" in imported.stderr.splitlines()[-1]
 
 
-@pytest.mark.parametrize(("module", "command"), [("sapien", "run"), ("viser", "view")])
+@pytest.mark.parametrize(("module", "command"), [("sapien", "run"), ("torchrl", "bench")])
 def test_without_a_library_of_the_system_one_sentence_says_how_to_add_it(tmp_path: Path, module: str, command: str):
     reason = "libX11.so.6: cannot open shared object file: No such file or directory"
     (tmp_path / f"{module}.py").write_text(f"raise ImportError({reason!r})")
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); "
-    (tmp_path / "dora").write_text(f"{code} from dora.__main__ import start; sys.exit(start([{command!r}, 'cube']))")
+    (tmp_path / "dora").write_text(f"{code} from dora.__main__ import start; sys.exit(start([{command!r}, '--help']))")
     call = run(sys.executable, str(tmp_path / "dora"))
     assert call.returncode == errors.BAD_INPUT
     assert call.stderr.splitlines()[-1].startswith(f"A library of the system is missing ({reason})")
