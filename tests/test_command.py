@@ -222,6 +222,9 @@ def test_without_a_library_of_the_system_one_sentence_says_how_to_add_it(tmp_pat
     assert call.stderr.splitlines()[-1].startswith(f"A library of the system is missing ({reason})")
     assert "apt-get install libgl1" in call.stderr
     assert "Traceback" not in call.stderr
+    if module == "sapien":
+        imported = run(sys.executable, "-c", f"{code} import dora")
+        assert "LibraryMissingError: A library of the system is missing" in imported.stderr.splitlines()[-1]
 
 
 def test_a_module_that_is_missing_is_no_library_of_the_system():
