@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from dora.digests import check_file
 from dora.errors import InputError, shown
 from dora.reading import check_size, checked_xml, decoded, parse_json, read_bytes
 
@@ -67,6 +68,7 @@ def check_container(path: Path) -> None:
     kind = next((kind for first, kind in PACKED.items() if start.startswith(first)), None)
     if kind is not None:
         raise InputError(f"{path} is packed ({kind}), which is not read: unpack it.")
+    check_file(path)
     ending = path.suffix.lower()
     if ending == ".3mf":
         _check_3mf(path)

@@ -1,19 +1,39 @@
-"""Digests of settings and data: sha256 of values under stable keys, independent of the names of their classes."""
+"""Digests of settings and data: sha256 of values under stable keys, independent of the names of their classes.
+
+And checksums of files that people write, as `sha256sum` writes them: where a file `SHA256SUMS` in its folder or in the
+one above, or the file `NAME.sha256` beside it, has a checksum of it, a file is read only if it fits.
+"""
 
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
+import os
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
+
+from dora.errors import InputError
 
 KEY = "digest_key"
 """Key of a field's metadata whose value replaces the field's name in digests, so that it can be renamed."""
 
 SEAL = "digest"
 """Entry of a JSON object that holds the digest of its other entries."""
+
+SUMS, OWN_SUM = "SHA256SUMS", ".sha256"
+"""Name of the file with the checksums of a folder, and ending of the file with that of one file."""
+MOST_SUMS = 1_000_000
+"""Size of a file of checksums above which it is not read [bytes]."""
+DEPTH = 2
+"""Folders in which the checksum of a file is looked for: its own, and the one above."""
+LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
+"""A line of checksums."""
+HEAD = "# sha256 of the lines below: "
+"""First line of a text with a checksum, without the checksum."""
 
 
 def digest_of(value: Any) -> str:
@@ -45,6 +65,109 @@ def is_whole(content: Mapping[str, Any]) -> bool:
     return content.get(SEAL) == digest_of({name: value for name, value in content.items() if name != SEAL})
 
 
+def with_checksum(text: str) -> str:
+    """A text with its checksum in a line before it, see `check_text`."""
+    return f"{HEAD}{hashlib.sha256(text.encode()).hexdigest()}\n{text}"
+
+
+def check_text(text: str, path: Path) -> None:
+    """Refuse a text that `with_checksum` made and that was changed since; one that begins with no comment passes.
+
+    Args:
+        text: to check; the ends of its lines may be those of another system.
+        path: of its file, for the message.
+
+    Raises:
+        InputError: it was changed.
+    """
+    text = text.replace("\r\n", "\n")
+    if text.lstrip("\ufeff\0 \t\r\n").startswith("#") and text != with_checksum(text.partition("\n")[2]):
+        raise InputError(
+            f"{path} is not as it was written, by the checksum in its first line: restore it, or remove that line to "
+            "use it as it is."
+        )
+
+
+def check_file(path: Path, content: bytes | None = None) -> None:
+    """Refuse a file that is not as its checksum says, if there is one (docs/files.md).
+
+    Args:
+        path: of the file.
+        content: of it, where it was read already.
+
+    Raises:
+        InputError: it was damaged or changed, or cannot be read.
+    """
+    for sums, name in _places(path):
+        expected = listed_checksums(sums).get(name)
+        if expected is None:
+            continue
+        if (file_sha256(path) if content is None else hashlib.sha256(content).hexdigest()) != expected:
+            raise InputError(
+                f"{path} is not as its checksum in {sums.name} says, so it was damaged or changed: restore it; if you "
+                f"changed it, write {sums} again by `sha256sum`, or remove it."
+            )
+
+
+def check_folder(folder: Path) -> None:
+    """Check all files that the checksums of a folder name, as `sha256sum --check` does; see `check_file`.
+
+    Raises:
+        InputError: one is missing, was damaged or changed, or cannot be read.
+    """
+    for name in listed_checksums(folder / SUMS):
+        if not os.path.isfile(folder / name):
+            raise InputError(f"{folder / name} is missing, and {SUMS} names it: restore it, or remove its line there.")
+        check_file(folder / name)
+
+
+def listed_checksums(sums: Path) -> dict[str, str]:
+    """The checksums in a file, by the name of what they are of; none if there is no such file.
+
+    Raises:
+        InputError: it is too large or cannot be read.
+    """
+    try:
+        if not os.path.isfile(sums):
+            return {}
+        with sums.open("rb") as stream:
+            content = stream.read(MOST_SUMS + 1)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{sums} cannot be read ({error}): check its permissions, or remove it.") from error
+    if len(content) > MOST_SUMS:
+        raise InputError(f"{sums} has more than {MOST_SUMS} bytes: keep the lines of the files that are needed.")
+    lines = (LINE.fullmatch(line) for line in os.fsdecode(content).splitlines())
+    found = {os.path.normpath(line[2]): line[1].lower() for line in lines if line}
+    return {name: checksum for name, checksum in found.items() if not name.startswith((os.sep, os.pardir))}
+
+
+def file_sha256(path: Path) -> str:
+    """sha256, in hexadecimal, of a file.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}): check its permissions.") from error
+
+
+def _places(path: Path) -> Iterator[tuple[Path, str]]:
+    """Files that may have the checksum of a file, and its name there."""
+    path = Path(os.path.abspath(path))
+    yield path.parent / (path.name + OWN_SUM), path.name
+    for folder in path.parents[:DEPTH]:
+        yield folder / SUMS, path.relative_to(folder).as_posix()
+
+
+def _array_of(value: Any) -> np.ndarray | None:
+    """The numbers of a tensor of PyTorch, which is loaded where there are any; None for another value."""
+    torch = sys.modules.get("torch")
+    return value.detach().numpy() if torch is not None and isinstance(value, torch.Tensor) else None
+
+
 def _feed(digest: Any, value: Any) -> None:
     """Adds a value, preceded by its kind and length, so that different values give different bytes."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -61,8 +184,8 @@ def _feed(digest: Any, value: Any) -> None:
         _head(digest, "sequence", len(value))
         for item in value:
             _feed(digest, item)
-    elif isinstance(value, Tensor):
-        _feed(digest, value.detach().numpy())
+    elif (array := _array_of(value)) is not None:
+        _feed(digest, array)
     elif isinstance(value, np.ndarray):
         _feed(digest, [str(value.dtype), list(value.shape), np.ascontiguousarray(value).tobytes()])
     elif isinstance(value, bytes):

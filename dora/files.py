@@ -18,6 +18,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from dora.digests import SUMS, file_sha256, listed_checksums
 from dora.errors import InputError, shown
 from dora.reading import check_size, parse_json
 
@@ -71,6 +72,19 @@ def write_bytes(path: Path, content: bytes) -> None:
     finally:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
+
+
+def renew_checksums(folder: Path) -> None:
+    """Write `SHA256SUMS` of a folder again, for the files that it names and that are there; without one, do nothing.
+
+    For programs that write the files of such a folder; `dora.digests.check_file` compares them.
+
+    Raises:
+        InputError: a file cannot be read or written.
+    """
+    names = [name for name in listed_checksums(folder / SUMS) if os.path.isfile(folder / name)]
+    if names:
+        write_bytes(folder / SUMS, "".join(f"{file_sha256(folder / name)}  {name}\n" for name in names).encode())
 
 
 def make_folder(folder: Path) -> None:

@@ -22,6 +22,7 @@ from xml.parsers import expat
 import numpy as np
 import yaml
 
+from dora.digests import check_file
 from dora.errors import InputError, shown
 
 MOST_TEXT = 8_000_000
@@ -87,7 +88,7 @@ def read_bytes(path: Path, what: str, most: int = MOST_TEXT) -> bytes:
         most: size above which it is refused, without being read [bytes].
 
     Raises:
-        InputError: there is no such file, it is too large, or it cannot be read.
+        InputError: there is no such file, it is too large, cannot be read, or is not as its checksum says.
     """
     check_size(path, what, most)
     try:
@@ -97,6 +98,7 @@ def read_bytes(path: Path, what: str, most: int = MOST_TEXT) -> bytes:
         raise InputError(f"{path} cannot be read ({error.strerror}): check its permissions.") from error
     if len(content) > most:
         raise InputError(f"{path} grows while it is read; wait until it is written.")
+    check_file(path, content)
     return content
 
 
@@ -393,7 +395,6 @@ class TomlTables:
 
     def positive(self, value: Any, where: str) -> float:
         """A positive number."""
-        (number,) = self.numbers([value], 1, where)
-        if number <= 0:
+        if (number := self.numbers([value], 1, where)[0]) <= 0:
             raise self.fail(f"{where} is {number}; it must be positive.")
         return number

@@ -1,5 +1,8 @@
 """Damage to files, drawn from a seed, and what a loader makes of it: accepted, refused, or a traceback.
 
+Each is loaded twice: as it is, which tells whether something other than a sentence comes of it, and beside `SHA256SUMS`
+of the intact files, with which nothing may be accepted.
+
 `python tests/damage.py 200` damages 200 files for each loader of `probes.LOADERS` and prints a table.
 """
 
@@ -16,6 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from dora.digests import SUMS, file_sha256
 from dora.errors import InputError
 
 WORDS = (
@@ -89,7 +93,8 @@ class Loader:
         make: writes intact files into an empty folder.
         load: reads them; raises InputError if they are refused.
         damaged: patterns of the files that are damaged.
-        sealed: whether every damage has to be refused, because a digest covers the file.
+        sealed: whether every damage has to be refused, because a digest covers the file; the others are files that
+            people or other programs write, in which a change may be another valid value.
     """
 
     make: Callable[[Path], object]
@@ -100,10 +105,14 @@ class Loader:
 
 @dataclass
 class Outcome:
-    """What became of the damaged files of a loader: counts, the slowest call [s], growth of the memory [MB]."""
+    """What became of the damaged files of a loader: counts, the slowest call [s], growth of the memory [MB].
+
+    `accepted` counts files as they are, `despite` those that were accepted although they have checksums.
+    """
 
     probes: int = 0
     accepted: int = 0
+    despite: int = 0
     refused: int = 0
     tracebacks: list[str] = field(default_factory=list)
     unclear: list[str] = field(default_factory=list)
@@ -133,6 +142,8 @@ class Probe:
         self._before = peak()
         self.files = sorted(path for pattern in loader.damaged for path in self.intact.rglob(pattern) if path.is_file())
         assert self.files, f"{name} has no files to damage"
+        names = [path.relative_to(self.intact).as_posix() for path in self.files]
+        self.checksums = "".join(f"{file_sha256(self.intact / name)}  {name}\n" for name in names)
 
     def damage(self, draw: random.Random) -> None:
         """Loads the files after one of them was damaged, and counts what became of it."""
@@ -144,22 +155,32 @@ class Probe:
         shutil.rmtree(self.copy, ignore_errors=True)
         shutil.copytree(self.intact, self.copy)
         (self.copy / path.relative_to(self.intact)).write_bytes(damaged)
-        outcome = self.outcome
-        outcome.probes += 1
+        self.outcome.probes += 1
+        accepted = self._load(path.name)
+        self.outcome.accepted += accepted is True
+        self.outcome.refused += accepted is False
+        if not self.loader.sealed:
+            (self.copy / SUMS).write_text(self.checksums)
+            self.outcome.despite += self._load(path.name) is True
+
+    def _load(self, name: str) -> bool | None:
+        """Loads the copy, in which the file of this name is damaged; whether it was accepted, None for a traceback."""
+        outcome, accepted = self.outcome, None
         start = time.perf_counter()
         try:
             with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
                 warnings.simplefilter("ignore")
                 self.loader.load(self.copy)
-            outcome.accepted += 1
+            accepted = True
         except InputError as error:
-            outcome.refused += 1
+            accepted = False
             if "\n" in str(error) or len(str(error)) > 1300 or not str(error).strip():
                 outcome.unclear.append(str(error))
         except Exception as error:
-            outcome.tracebacks.append(f"{path.name}: {type(error).__name__}: {error}"[:300])
+            outcome.tracebacks.append(f"{name}: {type(error).__name__}: {error}"[:300])
         outcome.slowest = max(outcome.slowest, time.perf_counter() - start)
-        outcome.grown = peak() - self._before
+        outcome.grown = max(outcome.grown, peak() - self._before)
+        return accepted
 
 
 def probe(name: str, loader: Loader, count: int, folder: Path, seed: int = 0) -> Outcome:
@@ -178,17 +199,17 @@ def main(words: list[str]) -> int:
 
     count = int(words[0]) if words else 200
     missed = 0
-    print(f"{'loader':24} files accepted refused tracebacks slowest [s] memory [MB]")
+    print(f"{'loader':24} files accepted (with checksums) refused tracebacks slowest [s] memory [MB]")
     for name, loader in LOADERS.items():
         if words[1:] and name not in words[1:]:
             continue
         with tempfile.TemporaryDirectory() as folder:
             o = probe(name, loader, count, Path(folder))
-        bad = (o.accepted if loader.sealed else 0) + len(o.tracebacks) + len(o.unclear)
+        bad = o.despite + (o.accepted if loader.sealed else 0) + len(o.tracebacks) + len(o.unclear)
         missed += bool(bad or o.slowest > 5 or o.grown > 1000)
         print(
-            f"{name:24} {o.probes:5} {o.accepted:8} {o.refused:7} {len(o.tracebacks):10} {o.slowest:11.2f} "
-            f"{o.grown:11.0f}{'   has a digest' if loader.sealed else ''}",
+            f"{name:24} {o.probes:5} {o.accepted:8} {o.despite:16} {o.refused:7} {len(o.tracebacks):10} "
+            f"{o.slowest:11.2f} {o.grown:11.0f}{'   has a digest' if loader.sealed else ''}",
             flush=True,
         )
         for line in sorted({*o.tracebacks, *o.unclear})[:8]:

@@ -19,7 +19,7 @@ from tensordict import TensorDict
 from dora.affordance.candidates import GraspCandidates
 from dora.affordance.hand import link_meshes
 from dora.affordance.maps.affordance_map import AffordanceMap
-from dora.affordance.objects import catalogue, decomposition
+from dora.affordance.objects import articulation, catalogue, decomposition
 from dora.affordance.objects.articulation import ARTICULATION_FILE, load_mount
 from dora.affordance.objects.folder_reading import read_object_folder
 from dora.affordance.objects.folder_writing import write_object_folder
@@ -36,7 +36,7 @@ from dora.agents.reports.report import tables, write_report
 from dora.agents.reports.run_results import find_runs
 from dora.agents.runs.progress_table import ProgressTable
 from dora.agents.runs.run_folder import RunFolder
-from dora.agents.runs.stored_results import OF_TABLES
+from dora.agents.runs.stored_results import OF_TABLES, read_result
 from dora.digests import SEAL
 from dora.live.recordings import Recording, seal
 from dora.policies.card import Card
@@ -172,9 +172,10 @@ def load_report(folder: Path) -> object:
     return write_report(folder, folder / "out")
 
 
-def mark_unfinished(folder: Path) -> None:
-    """What a run does that goes on."""
+def mark_unfinished(folder: Path) -> object:
+    """What a run does that goes on; a result that was changed does not become a good one by that."""
     RunFolder(folder).mark_unfinished()
+    return read_result(folder / "result.json")
 
 
 def write_card(folder: Path) -> None:
@@ -236,6 +237,7 @@ def write_mounted(folder: Path) -> None:
 
 
 def load_mounted(folder: Path) -> Any:
+    articulation._read.cache_clear()
     return load_mount(read_object_folder(folder / "microwave"))
 
 
@@ -314,10 +316,10 @@ LOADERS: dict[str, Loader] = {
     "reach table": Loader(write_table, load_table, sealed=True),
     "hulls in the cache": Loader(write_hulls, load_hulls, sealed=True),
     "affordance map": Loader(write_map, load_map, sealed=True),
-    "config.yaml": Loader(write_config, load_config),
+    "config.yaml": Loader(write_config, load_config, sealed=True),
     "config.yaml, first": Loader(write_first_config, load_config),
     "result.json": Loader(write_result, load_results, ("result.json",), sealed=True),
-    "result.json, marked": Loader(write_result, mark_unfinished, ("result.json",)),
+    "result.json, marked": Loader(write_result, mark_unfinished, ("result.json",), sealed=True),
     "card": Loader(write_card, load_card, sealed=True),
     "mesh of a robot": Loader(write_robot_mesh, load_robot_mesh),
     "curve.csv": Loader(write_result, load_results, ("curve.csv",), sealed=True),

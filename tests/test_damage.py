@@ -1,4 +1,4 @@
-"""Damaged files of every loader end in one sentence: nothing that a digest covers is accepted, nothing is a traceback.
+"""Damaged files of every loader end in a sentence: nothing that has a digest or a checksum is accepted, no traceback.
 
 `python tests/damage.py 200` does the same with more files and prints figures.
 """
@@ -36,6 +36,7 @@ def test_damaged_files_are_refused_in_one_sentence(name: str, tmp_path: Path):
         assert one.outcome.tracebacks == []
         assert one.outcome.unclear == []
         assert not (LOADERS[name].sealed and one.outcome.accepted)
+        assert not one.outcome.despite
         assert one.outcome.slowest < 5
         assert one.outcome.grown < 1000
 
@@ -52,9 +53,9 @@ def test_the_probes_notice_what_is_accepted_and_what_is_a_traceback(tmp_path: Pa
         assert (folder / "file").read_text(errors="replace") == "content 1"
 
     outcome = probe("all", Loader(make, lambda folder: None), 10, tmp_path / "all")
-    assert (outcome.accepted, outcome.tracebacks) == (outcome.probes, [])
+    assert (outcome.accepted, outcome.despite, outcome.tracebacks) == (outcome.probes, outcome.probes, [])
     outcome = probe("none", Loader(make, careless), 10, tmp_path / "none")
-    assert len(outcome.tracebacks) == outcome.probes > 0
+    assert len(outcome.tracebacks) == 2 * outcome.probes > 0
 
 
 @pytest.mark.parametrize(

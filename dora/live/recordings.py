@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import zlib
 from collections.abc import Mapping
@@ -15,6 +14,7 @@ import h5py
 import numpy as np
 from jaxtyping import Float
 
+from dora.digests import check_file, file_sha256
 from dora.errors import InputError, shown
 from dora.reading import check_size, read_bytes, read_json
 from dora.tasks import check_task_id
@@ -139,6 +139,7 @@ def _check_whole(path: Path) -> None:
     Raises:
         InputError: a file was damaged or changed, or cannot be read.
     """
+    check_file(path)
     sums = path.with_suffix(SUMS)
     if not os.path.lexists(sums):
         return
@@ -155,15 +156,7 @@ def _check_whole(path: Path) -> None:
 
 def _sums(path: Path) -> str:
     """A line for each file of a recording, as of `sha256sum`."""
-    return "".join(f"{_sha256(file)}  {file.name}\n" for file in (path, path.with_suffix(".json")))
-
-
-def _sha256(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"Cannot read {path} ({error.strerror or error}): give the path of a recording.") from error
+    return "".join(f"{file_sha256(file)}  {file.name}\n" for file in (path, path.with_suffix(".json")))
 
 
 def _named(episode: Any, path: Path) -> tuple[str, int]:

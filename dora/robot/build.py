@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from dora.errors import InputError, command
-from dora.files import write_bytes
+from dora.files import renew_checksums, write_bytes
 from dora.geometry.rotations import rpy_from_z_axis
 from dora.reading import read_yaml
 
@@ -71,6 +71,7 @@ def write_urdf(folder: Path) -> Path:
         raise InputError(f"{table} has a value of the wrong type ({error}): correct it.") from error
     target = folder / "robot.urdf"
     write_bytes(target, text.encode())
+    renew_checksums(folder)
     return target
 
 

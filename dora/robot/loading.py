@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 import dora
+from dora.digests import check_folder
 from dora.errors import InputError, shown, suggestion
 from dora.reading import Table, TomlTables, entries, read_toml
 from dora.robot.description import Contact, Coupling, Finger, JointGroup, Posture, RobotDescription
@@ -80,6 +81,7 @@ def load_robot(name_or_folder: str | Path) -> RobotDescription:
 @cache
 def _load(folder: Path) -> RobotDescription:
     path = folder / ROBOT_FILE
+    check_folder(folder)
     content = read_toml(path, "file about a robot")
     urdf = content.get("urdf", "robot.urdf")
     if not isinstance(urdf, str) or not urdf.isprintable() or not (folder / urdf).resolve().is_relative_to(folder):

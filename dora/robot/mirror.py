@@ -23,7 +23,7 @@ import trimesh
 
 from dora.containers import MOST_FACES, check_container, check_triangles
 from dora.errors import InputError, command
-from dora.files import make_folder, write_bytes
+from dora.files import make_folder, renew_checksums, write_bytes
 from dora.reading import read_text, read_toml
 from dora.robot.build import urdf_number
 from dora.robot.loading import NAME, ROBOT_FILE, load_robot
@@ -191,6 +191,7 @@ def write_mirrored(source: Path, target: Path) -> list[Path]:
     for path, content in written.items():
         make_folder(path.parent)
         write_bytes(path, content)
+    renew_checksums(target)
     return list(written)
 
 

@@ -21,7 +21,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from dora.errors import InputError, command, shown
-from dora.files import make_folder, write_bytes
+from dora.files import make_folder, renew_checksums, write_bytes
 from dora.reading import read_yaml
 
 Row = Mapping[str, Any]
@@ -75,6 +75,7 @@ def write_meshes(folder: Path) -> list[Path]:
         path = target / f"{name}.glb"
         write_bytes(path, cast(bytes, scene.export(file_type="glb", include_normals=True)))
         paths.append(path)
+    renew_checksums(folder)
     return paths
 
 

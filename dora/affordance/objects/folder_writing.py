@@ -13,7 +13,7 @@ from dora.affordance.objects.affordance_object import AffordanceObject, Piece
 from dora.affordance.objects.folder_reading import FORMAT, OBJECT_FILE, read_object_folder
 from dora.affordance.objects.mesh_files import write_ply
 from dora.errors import InputError
-from dora.files import write_bytes
+from dora.files import renew_checksums, write_bytes
 from dora.robot.shapes import Shape
 
 MESH, SOLID, HULL = "mesh.ply", "solid.ply", "hull-{}.ply"
@@ -64,6 +64,7 @@ def write_object_folder(obj: AffordanceObject, folder: Path | str) -> Path:
     for old in folder.glob("*.ply"):
         if WRITTEN.fullmatch(old.name) and old.name not in kept:
             old.unlink()
+    renew_checksums(folder)
     return folder / OBJECT_FILE
 
 

@@ -16,6 +16,7 @@ from trimesh.exchange.ply import load_ply
 
 from dora.affordance.objects.palette import PALETTE, colours
 from dora.containers import MOST_BYTES, check_lines, check_triangles
+from dora.digests import check_file
 from dora.errors import InputError
 from dora.files import write_bytes
 
@@ -69,6 +70,7 @@ def read_ply(path: Path) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"] | None]
         raise InputError(f"there is no mesh file {path}; put it there or correct its name.")
     if path.stat().st_size > MOST_BYTES:
         raise InputError(f"{path} has {path.stat().st_size} bytes; reduce the mesh to at most {MOST_BYTES}.")
+    check_file(path)
     check_lines(path)
     try:
         with path.open("rb") as stream:

@@ -18,9 +18,10 @@ from dora.agents.evaluation.evaluate import Evaluation
 from dora.agents.limits import check
 from dora.agents.runs.stored_results import MOST_RESULT, with_digests
 from dora.configs import plain
+from dora.digests import SEAL, check_text, is_whole, with_checksum
 from dora.errors import InputError
 from dora.files import check_name, write_bytes, write_csv, write_json
-from dora.reading import read_json, read_yaml
+from dora.reading import read_json, read_text, read_yaml
 from dora.version import VERSION, source_commit
 
 PACKAGES = ("mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
@@ -199,15 +200,16 @@ class RunFolder:
             self.write_result(result | {"finished": False})
 
     def _stored_result(self) -> Any:
-        """What `result.json` holds; None where it cannot be read."""
+        """What `result.json` holds; None where it cannot be read or was changed, so that it gets no new digest."""
         try:
-            return read_json(self.path / "result.json", "result", MOST_RESULT)
+            result = read_json(self.path / "result.json", "result", MOST_RESULT)
         except InputError:
             return None
+        return None if isinstance(result, dict) and SEAL in result and not is_whole(result) else result
 
     def write_config(self, config: RunConfig) -> None:
-        """Write `config.yaml`."""
-        write_bytes(self.path / "config.yaml", yaml.safe_dump(plain(config), sort_keys=False).encode())
+        """Write `config.yaml`, with its checksum."""
+        write_bytes(self.path / "config.yaml", with_checksum(yaml.safe_dump(plain(config), sort_keys=False)).encode())
 
     def read_config(self) -> RunConfig:
         """Settings of the run.
@@ -218,6 +220,7 @@ class RunFolder:
         path = self.path / "config.yaml"
         if not os.path.isfile(path):
             raise InputError(f"{self.path} is not a run folder (no readable config.yaml): give one that a run printed.")
+        check_text(read_text(path, "file of settings"), path)
         config = config_from_dict(read_yaml(path, "file of settings"), f"the settings in {path}")
         try:
             check(config, stored=True)
