@@ -104,12 +104,12 @@ def with_scrap(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 BREAKS = {
     "soup": (soup, ""),
-    "inside out": (lambda m: with_faces(m, m.faces[:, ::-1]), "turned 1 bodies outwards"),
-    "mixed winding": (every_third_turned, "turned 1 bodies outwards"),
-    "hole": (lambda m: with_faces(m, m.faces[1:]), "filled 1 holes"),
+    "inside out": (lambda m: with_faces(m, m.faces[:, ::-1]), "turned a body outwards"),
+    "mixed winding": (every_third_turned, "turned a body outwards"),
+    "hole": (lambda m: with_faces(m, m.faces[1:]), "filled a hole"),
     "double faces": (with_double_faces, "dropped 4 degenerate or double faces"),
     "two bodies": (lambda m: joined([m, bar()]), "united 2 bodies"),
-    "scrap": (with_scrap, "dropped 1 loose scraps"),
+    "scrap": (with_scrap, "dropped a loose scrap"),
 }
 
 
@@ -131,7 +131,7 @@ def test_labels_survive_repair():
     x = fixed.mesh.triangles_center[:, 0]
     assert (fixed.labels[x > 0.0301] == 1).all()
     assert (fixed.labels[x < 0.0299] == 0).all()
-    assert fixed.actions == ("filled 1 holes", "united 2 bodies")
+    assert fixed.actions == ("filled a hole", "united 2 bodies")
 
 
 def test_touching_bodies_are_united():

@@ -106,7 +106,7 @@ def test_scraps_are_dropped_and_it_is_said(piece: trimesh.Trimesh):
     found = mended(cylinder(), piece)
     assert found.mesh.volume == pytest.approx(cylinder().volume, rel=1e-9)
     share = piece.area / (cylinder().area + piece.area)
-    assert found.actions == (f"dropped 1 loose scraps of surface ({share:.1%} of it)",)
+    assert found.actions == (f"dropped a loose scrap of surface ({share:.1%} of it)",)
 
 
 def test_a_surface_of_many_scraps_is_refused():
@@ -160,7 +160,8 @@ def test_open_sheets_are_closed_and_it_is_said(meshes: tuple[trimesh.Trimesh, ..
     assert found.mesh.is_watertight
     assert volume is None or found.mesh.volume == pytest.approx(volume)
     (said,) = [action for action in found.actions if "closed" in action]
-    assert said.startswith(f"closed {mouths} wide openings of a surface without thickness")
+    opened = "a wide opening" if mouths == 1 else f"{mouths} wide openings"
+    assert said.startswith(f"closed {opened} of a surface without thickness")
     assert "treated as solid" in said
     assert found.bodies[0].sheet is not None
     assert found.bodies[0].sheet.area == pytest.approx(meshes[0].area)
@@ -182,10 +183,10 @@ def test_a_body_inside_another_is_a_cavity_if_its_faces_point_the_other_way():
         assert found.mesh.volume == pytest.approx(cylinder().volume)
         ((cavity,),) = found.cavities
         assert cavity.volume == pytest.approx(inner.volume)
-        assert "found 1 closed cavities" in " ".join(found.actions)
+        assert "found a closed cavity" in " ".join(found.actions)
     solid = mended(cylinder(), inner)
     assert solid.cavities == ((),)
-    assert "filled 1 bodies inside others" in " ".join(solid.actions)
+    assert "filled a body inside another" in " ".join(solid.actions)
 
 
 @pytest.mark.parametrize(

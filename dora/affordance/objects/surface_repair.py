@@ -170,19 +170,28 @@ def _actions(
     mouths = sum(body.mouths for body in outer)
     cavities = sum(len(each) for each in found.cavities)
     added = sum(body.added for body in outer if body.sheet is not None) / area
-    counts = {
-        "dropped {} degenerate or double faces": dropped,
-        f"dropped {{}} loose scraps of surface ({sum(scraps) / area:.1%} of it)": len(scraps),
-        "filled {} holes": sum(body.holes for body in outer),
-        f"closed {{}} wide openings of a surface without thickness (+{added:.0%} of surface): it is treated as "
-        "solid, hands stay out of it, and it weighs as a shell": mouths,
-        "turned {} bodies outwards": sum(body.turned for body in outer),
-        "found {} closed cavities, which weigh nothing and which hands do not enter": cavities,
-        "filled {} bodies inside others, whose faces point the same way: turn these if they are cavities": inside,
-        "united {} bodies": len(outer) if len(outer) > 1 else 0,
-        "hold {} groups of bodies that do not touch together as one rigid body": clusters if clusters > 1 else 0,
-    }
-    return tuple(text.format(count) for text, count in counts.items() if count)
+    scrap, wide = f"surface ({sum(scraps) / area:.1%} of it)", f"a surface without thickness (+{added:.0%} of surface)"
+    solid = "it is treated as solid, hands stay out of it, and it weighs as a shell"
+    done = (
+        (dropped, "dropped a degenerate or double face", "dropped {} degenerate or double faces"),
+        (len(scraps), f"dropped a loose scrap of {scrap}", f"dropped {{}} loose scraps of {scrap}"),
+        (sum(body.holes for body in outer), "filled a hole", "filled {} holes"),
+        (mouths, f"closed a wide opening of {wide}: {solid}", f"closed {{}} wide openings of {wide}: {solid}"),
+        (sum(body.turned for body in outer), "turned a body outwards", "turned {} bodies outwards"),
+        (
+            cavities,
+            "found a closed cavity, which weighs nothing and which hands do not enter",
+            "found {} closed cavities, which weigh nothing and which hands do not enter",
+        ),
+        (
+            inside,
+            "filled a body inside another, whose faces point the same way: turn these if it is a cavity",
+            "filled {} bodies inside others, whose faces point the same way: turn these if they are cavities",
+        ),
+        (len(outer) if len(outer) > 1 else 0, "", "united {} bodies"),
+        (clusters if clusters > 1 else 0, "", "hold {} groups of bodies that do not touch together as one rigid body"),
+    )
+    return tuple(one if count == 1 else many.format(count) for count, one, many in done if count)
 
 
 def _closed(part: trimesh.Trimesh, labels: np.ndarray, total_area: float, name: str) -> Body:
