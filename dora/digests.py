@@ -1,7 +1,7 @@
 """Digests of settings and data: sha256 of values under stable keys, independent of the names of their classes.
 
-And checksums of files that people write, as `sha256sum` writes them: where a file `SHA256SUMS` in its folder or in the
-one above, or the file `NAME.sha256` beside it, has a checksum of it, a file is read only if it fits.
+And checksums of files that people write, as `sha256sum` writes them: where a file `SHA256SUMS` in its folder or in one
+of the two above, or the file `NAME.sha256` beside it, has a checksum of it, a file is read only if it fits.
 """
 
 import dataclasses
@@ -28,8 +28,8 @@ SUMS, OWN_SUM = "SHA256SUMS", ".sha256"
 """Name of the file with the checksums of a folder, and ending of the file with that of one file."""
 MOST_SUMS = 1_000_000
 """Size of a file of checksums above which it is not read [bytes]."""
-DEPTH = 2
-"""Folders in which the checksum of a file is looked for: its own, and the one above."""
+DEPTH = 3
+"""Folders in which the checksum of a file is looked for: its own, and those above."""
 LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
 """A line of checksums."""
 HEAD = "# sha256 of the lines below: "
@@ -110,15 +110,19 @@ def check_file(path: Path, content: bytes | None = None) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Check all files that the checksums of a folder name, as `sha256sum --check` does; see `check_file`.
+    """Check all files in a folder that have checksums, as `sha256sum --check` does; see `check_file`.
 
     Raises:
         InputError: one is missing, was damaged or changed, or cannot be read.
     """
-    for name in listed_checksums(folder / SUMS):
-        if not os.path.isfile(folder / name):
-            raise InputError(f"{folder / name} is missing, and {SUMS} names it: restore it, or remove its line there.")
-        check_file(folder / name)
+    folder = Path(os.path.abspath(folder))
+    for place in (folder, *folder.parents)[:DEPTH]:
+        for path in (place / name for name in listed_checksums(place / SUMS)):
+            if not path.is_relative_to(folder):
+                continue
+            if not os.path.isfile(path):
+                raise InputError(f"{path} is missing, and {place / SUMS} names it: restore it, or remove that line.")
+            check_file(path)
 
 
 def listed_checksums(sums: Path) -> dict[str, str]:

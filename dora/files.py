@@ -18,7 +18,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from dora.digests import SUMS, file_sha256, listed_checksums
+from dora.digests import DEPTH, SUMS, file_sha256, listed_checksums
 from dora.errors import InputError, shown
 from dora.reading import check_size, parse_json
 
@@ -75,16 +75,25 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def renew_checksums(folder: Path) -> None:
-    """Write `SHA256SUMS` of a folder again, for the files that it names and that are there; without one, do nothing.
+    """Write the checksums of files in a folder again, where `SHA256SUMS` of it or of one above has any.
 
     For programs that write the files of such a folder; `dora.digests.check_file` compares them.
 
     Raises:
         InputError: a file cannot be read or written.
     """
-    names = [name for name in listed_checksums(folder / SUMS) if os.path.isfile(folder / name)]
-    if names:
-        write_bytes(folder / SUMS, "".join(f"{file_sha256(folder / name)}  {name}\n" for name in names).encode())
+    folder = Path(os.path.abspath(folder))
+    for place in (folder, *folder.parents)[:DEPTH]:
+        old = listed_checksums(place / SUMS)
+        new = dict(old)
+        for name in old:
+            if (place / name).is_relative_to(folder):
+                new.pop(name)
+                if os.path.isfile(place / name):
+                    new[name] = file_sha256(place / name)
+        if new != old:
+            lines = [f"{new[name]}  {name}\n" for name in sorted(new)]
+            write_bytes(place / SUMS, os.fsencode("".join(lines)))
 
 
 def make_folder(folder: Path) -> None:

@@ -220,12 +220,12 @@ class RunFolder:
         path = self.path / "config.yaml"
         if not os.path.isfile(path):
             raise InputError(f"{self.path} is not a run folder (no readable config.yaml): give one that a run printed.")
-        check_text(read_text(path, "file of settings"), path)
         config = config_from_dict(read_yaml(path, "file of settings"), f"the settings in {path}")
         try:
             check(config, stored=True)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
+        check_text(read_text(path, "file of settings"), path)
         return config
 
     def write_curve(self, rows: list[list[Any]]) -> None:
