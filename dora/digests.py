@@ -1,7 +1,7 @@
 """Digests of settings and data: sha256 of values under stable keys, independent of the names of their classes.
 
-And checksums of files that people write, as `sha256sum` writes them: where a file `SHA256SUMS` in its folder or in one
-of the two above, or the file `NAME.sha256` beside it, has a checksum of it, a file is read only if it fits.
+And checksums of files that people write, as `sha256sum` writes them: `SHA256SUMS` in the folder of a file or in one of
+the two above, and `NAME.sha256` beside it.
 """
 
 import dataclasses
@@ -10,7 +10,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +25,19 @@ SEAL = "digest"
 """Entry of a JSON object that holds the digest of its other entries."""
 
 SUMS, OWN_SUM = "SHA256SUMS", ".sha256"
-"""Name of the file with the checksums of a folder, and ending of the file with that of one file."""
+"""Name of a file with the checksums of several files, and ending of the file with that of one file."""
 MOST_SUMS = 1_000_000
 """Size of a file of checksums above which it is not read [bytes]."""
 DEPTH = 3
 """Folders in which the checksum of a file is looked for: its own, and those above."""
-LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
-"""A line of checksums."""
+LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)|SHA256 \((.+)\) = ([0-9a-fA-F]{64})")
+"""A line of checksums, as of `sha256sum` or of `sha256sum --tag`."""
+BARE = re.compile(r"[0-9a-fA-F]{64}")
+"""The line of a file that has nothing but the checksum."""
 HEAD = "# sha256 of the lines below: "
 """First line of a text with a checksum, without the checksum."""
+HEADED = re.compile(r"#.*(sha256|[0-9a-fA-F]{16})")
+"""A first line that is one with a checksum, maybe a damaged one."""
 
 
 def digest_of(value: Any) -> str:
@@ -71,7 +75,7 @@ def with_checksum(text: str) -> str:
 
 
 def check_text(text: str, path: Path) -> None:
-    """Refuse a text that `with_checksum` made and that was changed since; one that begins with no comment passes.
+    """Refuse a text that `with_checksum` made and that was changed since; one that begins with no checksum passes.
 
     Args:
         text: to check; the ends of its lines may be those of another system.
@@ -81,68 +85,85 @@ def check_text(text: str, path: Path) -> None:
         InputError: it was changed.
     """
     text = text.replace("\r\n", "\n")
-    if text.lstrip("\ufeff\0 \t\r\n").startswith("#") and text != with_checksum(text.partition("\n")[2]):
+    first = text.lstrip("\ufeff\0 \t\n").partition("\n")[0]
+    if HEADED.match(first) and text != with_checksum(text.partition("\n")[2]):
         raise InputError(
             f"{path} is not as it was written, by the checksum in its first line: restore it, or remove that line to "
             "use it as it is."
         )
 
 
-def check_file(path: Path, content: bytes | None = None) -> None:
-    """Refuse a file that is not as its checksum says, if there is one (docs/files.md).
-
-    Args:
-        path: of the file.
-        content: of it, where it was read already.
+def check_file(path: Path) -> None:
+    """Refuse a file that is not as its checksums say, if there are any (docs/files.md).
 
     Raises:
-        InputError: it was damaged or changed, or cannot be read.
+        InputError: it was damaged or changed, or a file of checksums beside it cannot be read.
     """
-    for sums, name in _places(path):
-        expected = listed_checksums(sums).get(name)
-        if expected is None:
-            continue
-        if (file_sha256(path) if content is None else hashlib.sha256(content).hexdigest()) != expected:
-            raise InputError(
-                f"{path} is not as its checksum in {sums.name} says, so it was damaged or changed: restore it; if you "
-                f"changed it, write {sums} again by `sha256sum`, or remove it."
-            )
+    path = Path(os.path.abspath(path))
+    own = path.parent / (path.name + OWN_SUM)
+    if os.path.isfile(own):
+        _compare(path, _own_checksum(own, path.name), own)
+    for place in path.parents[:DEPTH]:
+        expected = listed_checksums(place / SUMS, place == path.parent).get(path.relative_to(place).as_posix())
+        if expected is not None:
+            _compare(path, expected, place / SUMS)
 
 
 def check_folder(folder: Path) -> None:
-    """Check all files in a folder that have checksums, as `sha256sum --check` does; see `check_file`.
+    """Check all files in a folder that `SHA256SUMS` names, as `sha256sum --check` does; see `check_file`.
 
     Raises:
         InputError: one is missing, was damaged or changed, or cannot be read.
     """
     folder = Path(os.path.abspath(folder))
     for place in (folder, *folder.parents)[:DEPTH]:
-        for path in (place / name for name in listed_checksums(place / SUMS)):
-            if not path.is_relative_to(folder):
-                continue
-            if not os.path.isfile(path):
-                raise InputError(f"{path} is missing, and {place / SUMS} names it: restore it, or remove that line.")
-            check_file(path)
+        for name, expected in listed_checksums(place / SUMS, place == folder).items():
+            if (place / name).is_relative_to(folder):
+                _compare(place / name, expected, place / SUMS)
 
 
-def listed_checksums(sums: Path) -> dict[str, str]:
-    """The checksums in a file, by the name of what they are of; none if there is no such file.
+def listed_checksums(sums: Path, near: bool = True) -> dict[str, str]:
+    """The checksums in a file, by the path of what they are of, from its folder; none if there is no such file.
+
+    Args:
+        sums: path of the file.
+        near: whether it has to be readable; one in a folder above may belong to something else.
+
+    Raises:
+        InputError: it is too large or cannot be read.
+    """
+    if not os.path.isfile(sums):
+        return {}
+    try:
+        lines = lines_of_checksums(sums)
+    except InputError:
+        if near:
+            raise
+        return {}
+    found = dict(line for line in map(parsed_checksum, lines) if line)
+    return {name: found[name] for name in found if not name.startswith((os.sep, os.pardir)) and Path(name).name != SUMS}
+
+
+def lines_of_checksums(sums: Path) -> list[str]:
+    """The lines of a file of checksums, in which bytes that are no UTF-8 stand as `os.fsdecode` makes them.
 
     Raises:
         InputError: it is too large or cannot be read.
     """
     try:
-        if not os.path.isfile(sums):
-            return {}
         with sums.open("rb") as stream:
             content = stream.read(MOST_SUMS + 1)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{sums} cannot be read ({error}): check its permissions, or remove it.") from error
+    except OSError as error:
+        raise InputError(f"{sums} cannot be read ({error.strerror}): check its permissions, or remove it.") from error
     if len(content) > MOST_SUMS:
         raise InputError(f"{sums} has more than {MOST_SUMS} bytes: keep the lines of the files that are needed.")
-    lines = (LINE.fullmatch(line) for line in os.fsdecode(content).splitlines())
-    found = {os.path.normpath(line[2]): line[1].lower() for line in lines if line}
-    return {name: checksum for name, checksum in found.items() if not name.startswith((os.sep, os.pardir))}
+    return os.fsdecode(content).split("\n")
+
+
+def parsed_checksum(line: str) -> tuple[str, str] | None:
+    """Path and checksum in a line; None for another one."""
+    found = LINE.fullmatch(line.strip("\ufeff\r"))
+    return (os.path.normpath(found[2] or found[3]), (found[1] or found[4]).lower()) if found else None
 
 
 def file_sha256(path: Path) -> str:
@@ -158,12 +179,26 @@ def file_sha256(path: Path) -> str:
         raise InputError(f"{path} cannot be read ({error.strerror}): check its permissions.") from error
 
 
-def _places(path: Path) -> Iterator[tuple[Path, str]]:
-    """Files that may have the checksum of a file, and its name there."""
-    path = Path(os.path.abspath(path))
-    yield path.parent / (path.name + OWN_SUM), path.name
-    for folder in path.parents[:DEPTH]:
-        yield folder / SUMS, path.relative_to(folder).as_posix()
+def _own_checksum(own: Path, name: str) -> str:
+    """The checksum in a file that has that of one file; InputError if it has none."""
+    for line in lines_of_checksums(own):
+        if BARE.fullmatch(line.strip("\ufeff\r ")):
+            return line.strip("\ufeff\r ").lower()
+        path, checksum = parsed_checksum(line) or ("", "")
+        if Path(path).name == name:
+            return checksum
+    raise InputError(f"{own} has no checksum of {name}: write it again by `sha256sum {name} > {own.name}`.")
+
+
+def _compare(path: Path, expected: str, sums: Path) -> None:
+    """Refuse a file that is missing or has another checksum."""
+    if not os.path.isfile(path):
+        raise InputError(f"{path} is missing, and {sums} names it: restore it, or remove that line.")
+    if file_sha256(path) != expected:
+        raise InputError(
+            f"{path} is not as its checksum in {sums} says, so it was damaged or changed: restore it; if you changed "
+            "it yourself, write its checksum again by `sha256sum`, or remove that."
+        )
 
 
 def _array_of(value: Any) -> np.ndarray | None:

@@ -18,7 +18,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from dora.digests import DEPTH, SUMS, file_sha256, listed_checksums
+from dora.digests import DEPTH, OWN_SUM, SUMS, file_sha256, lines_of_checksums, listed_checksums, parsed_checksum
 from dora.errors import InputError, shown
 from dora.reading import check_size, parse_json
 
@@ -74,26 +74,39 @@ def write_bytes(path: Path, content: bytes) -> None:
             Path(temporary).unlink(missing_ok=True)
 
 
-def renew_checksums(folder: Path) -> None:
-    """Write the checksums of files in a folder again, where `SHA256SUMS` of it or of one above has any.
+def renew_checksums(written: Iterable[Path], removed: Iterable[Path] = ()) -> None:
+    """Write the checksums of files again, where they have any; `dora.digests.check_file` compares them.
 
-    For programs that write the files of such a folder; `dora.digests.check_file` compares them.
+    A file that is new gets one where others of its folder have one. Other lines stay as they are.
+
+    Args:
+        written: files that were written.
+        removed: files that were removed.
 
     Raises:
-        InputError: a file cannot be read or written.
+        InputError: a file of checksums cannot be read or written.
     """
-    folder = Path(os.path.abspath(folder))
-    for place in (folder, *folder.parents)[:DEPTH]:
-        old = listed_checksums(place / SUMS)
-        new = dict(old)
-        for name in old:
-            if (place / name).is_relative_to(folder):
-                new.pop(name)
-                if os.path.isfile(place / name):
-                    new[name] = file_sha256(place / name)
-        if new != old:
-            lines = [f"{new[name]}  {name}\n" for name in sorted(new)]
-            write_bytes(place / SUMS, os.fsencode("".join(lines)))
+    gone = {Path(os.path.abspath(path)) for path in removed}
+    for path in sorted({Path(os.path.abspath(path)) for path in written} | gone):
+        own = path.parent / (path.name + OWN_SUM)
+        if own.is_file():
+            own.unlink() if path in gone else write_bytes(own, os.fsencode(f"{file_sha256(path)}  {path.name}\n"))
+        for place in path.parents[:DEPTH]:
+            _renew(place / SUMS, path.relative_to(place).as_posix(), None if path in gone else file_sha256(path))
+
+
+def _renew(sums: Path, name: str, checksum: str | None) -> None:
+    """Write the line of a name in a file of checksums again, or leave it out."""
+    listed = listed_checksums(sums, near=False)
+    beside = any(os.path.dirname(other) == os.path.dirname(name) for other in listed)
+    if name not in listed and not (beside and checksum):
+        return
+    lines = lines_of_checksums(sums)
+    places = [i for i, line in enumerate(lines) if (parsed_checksum(line) or ("",))[0] == name]
+    new = [f"{checksum}  {name}"] if checksum else []
+    start = places[0] if places else len(lines) - (not lines[-1])
+    rest = [line for i, line in enumerate(lines) if i not in places]
+    write_bytes(sums, os.fsencode("\n".join(rest[:start] + new + rest[start:])))
 
 
 def make_folder(folder: Path) -> None:

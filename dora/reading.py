@@ -88,7 +88,7 @@ def read_bytes(path: Path, what: str, most: int = MOST_TEXT) -> bytes:
         most: size above which it is refused, without being read [bytes].
 
     Raises:
-        InputError: there is no such file, it is too large, cannot be read, or is not as its checksum says.
+        InputError: there is no such file, it is too large, or it cannot be read.
     """
     check_size(path, what, most)
     try:
@@ -98,7 +98,6 @@ def read_bytes(path: Path, what: str, most: int = MOST_TEXT) -> bytes:
         raise InputError(f"{path} cannot be read ({error.strerror}): check its permissions.") from error
     if len(content) > most:
         raise InputError(f"{path} grows while it is read; wait until it is written.")
-    check_file(path, content)
     return content
 
 
@@ -175,6 +174,7 @@ def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def read_toml(path: Path, what: str, most: int = MOST_SETTINGS) -> dict[str, Any]:
     """Content of a TOML file; arguments and errors as for `read_bytes`, and for what is no TOML or too deep."""
+    check_file(path)
     text = read_text(path, what, most)
     for number, line in enumerate(text.splitlines(), 1):
         if line.count(".") > MOST_DOTS:

@@ -140,6 +140,7 @@ def _check_whole(path: Path) -> None:
         InputError: a file was damaged or changed, or cannot be read.
     """
     check_file(path)
+    check_file(path.with_suffix(".json"))
     sums = path.with_suffix(SUMS)
     if not os.path.lexists(sums):
         return

@@ -16,6 +16,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from dora.digests import check_file
 from dora.errors import InputError, command
 from dora.files import renew_checksums, write_bytes
 from dora.geometry.rotations import rpy_from_z_axis
@@ -62,6 +63,7 @@ def write_urdf(folder: Path) -> Path:
     table = folder / "parameters.yaml"
     if not os.path.isfile(table):
         raise InputError(f"{table} does not exist; give the folder of a robot that has a parameter table.")
+    check_file(table)
     content = read_yaml(table, "parameter table")
     try:
         text = build_urdf(content)
@@ -71,7 +73,7 @@ def write_urdf(folder: Path) -> Path:
         raise InputError(f"{table} has a value of the wrong type ({error}): correct it.") from error
     target = folder / "robot.urdf"
     write_bytes(target, text.encode())
-    renew_checksums(folder)
+    renew_checksums([target])
     return target
 
 

@@ -67,6 +67,8 @@ def available_robots() -> list[str]:
 def load_robot(name_or_folder: str | Path) -> RobotDescription:
     """The description of a robot, by its name or by the folder of its `robot.toml`; read once per process.
 
+    Files that have checksums are compared each time.
+
     Raises:
         InputError: unknown robot, missing file, or a file whose content does not fit.
     """
@@ -75,13 +77,13 @@ def load_robot(name_or_folder: str | Path) -> RobotDescription:
     if not os.path.isfile(folder / ROBOT_FILE):
         hint = suggestion(name_or_folder, sorted(folders))
         raise InputError(f"unknown robot {str(name_or_folder)!r}: {hint}")
+    check_folder(folder.resolve())
     return _load(folder.resolve())
 
 
 @cache
 def _load(folder: Path) -> RobotDescription:
     path = folder / ROBOT_FILE
-    check_folder(folder)
     content = read_toml(path, "file about a robot")
     urdf = content.get("urdf", "robot.urdf")
     if not isinstance(urdf, str) or not urdf.isprintable() or not (folder / urdf).resolve().is_relative_to(folder):

@@ -191,7 +191,7 @@ def write_mirrored(source: Path, target: Path) -> list[Path]:
     for path, content in written.items():
         make_folder(path.parent)
         write_bytes(path, content)
-    renew_checksums(target)
+    renew_checksums(written)
     return list(written)
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dora.digests import check_file
 from dora.errors import InputError, shown
 from dora.geometry.rotations import matrix_from_quaternion, quaternion_multiply
 from dora.reading import read_text, read_xml
@@ -118,6 +119,7 @@ def read_urdf(path: Path) -> UrdfModel:
     """
     if not os.path.isfile(path):
         raise InputError(f"{path} does not exist; name the URDF file in robot.toml.")
+    check_file(path)
     read_text(path, "URDF")  # the simulator reads no other encoding
     robot = read_xml(path, "URDF")
     try:

@@ -20,6 +20,7 @@ from scipy.interpolate import CubicSpline
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from dora.digests import check_file
 from dora.errors import InputError, command, shown
 from dora.files import make_folder, renew_checksums, write_bytes
 from dora.reading import read_yaml
@@ -58,6 +59,7 @@ def write_meshes(folder: Path) -> list[Path]:
         InputError: as `build_meshes`, or a mesh has a name that is no plain one for a file; nothing is written then.
     """
     table = folder / "visuals.yaml"
+    check_file(table)
     content = read_yaml(table, "table of visual meshes")
     try:
         scenes = build_meshes(content)
@@ -75,7 +77,7 @@ def write_meshes(folder: Path) -> list[Path]:
         path = target / f"{name}.glb"
         write_bytes(path, cast(bytes, scene.export(file_type="glb", include_normals=True)))
         paths.append(path)
-    renew_checksums(folder)
+    renew_checksums(paths)
     return paths
 
 

@@ -17,6 +17,7 @@ from typing import Any
 from mani_skill.agents.registration import REGISTERED_AGENTS, register_agent
 from mani_skill.envs.sapien_env import BaseEnv
 
+from dora.digests import check_folder
 from dora.errors import InputError
 from dora.robot import available_robots, load_robot
 from dora.sim.robot_agent import DescribedRobot
@@ -71,6 +72,9 @@ def _load_agent(original: Any) -> Any:
         for uid in uids:
             if isinstance(uid, str) and uid not in REGISTERED_AGENTS and uid in available_robots():
                 register_robot(uid)
+            agent = REGISTERED_AGENTS.get(uid) if isinstance(uid, str) else None
+            if agent is not None and issubclass(agent.agent_cls, DescribedRobot):
+                check_folder(agent.agent_cls.description.folder)  # the simulator reads the files again
         return original(self, *args, **kwargs)
 
     return load_agent

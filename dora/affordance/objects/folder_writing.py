@@ -61,10 +61,10 @@ def write_object_folder(obj: AffordanceObject, folder: Path | str) -> Path:
             os.replace(new / OBJECT_FILE, folder / OBJECT_FILE)
     except OSError as error:
         raise InputError(f"cannot write {folder} ({error.strerror}): free some space and write it again.") from error
-    for old in folder.glob("*.ply"):
-        if WRITTEN.fullmatch(old.name) and old.name not in kept:
-            old.unlink()
-    renew_checksums(folder)
+    left = [old for old in folder.glob("*.ply") if WRITTEN.fullmatch(old.name) and old.name not in kept]
+    for old in left:
+        old.unlink()
+    renew_checksums([folder / name for name in (*kept, OBJECT_FILE)], left)
     return folder / OBJECT_FILE
 
 

@@ -21,6 +21,7 @@ from dora.affordance.objects.labels import WHOLE, FaceLabels, grasp_classes, rea
 from dora.affordance.objects.surface_repair import repair
 from dora.affordance.objects.surfaces.weighing import Weighing, check_weight, weigh
 from dora.containers import MOST_BYTES, MOST_FACES, check_container, check_groups, without_mark
+from dora.digests import check_file
 from dora.errors import InputError, shown
 from dora.reading import read_bytes
 
@@ -201,6 +202,7 @@ class _Neighbours(FilePathResolver):
         path = (plain if os.path.lexists(plain) else folder / unquote(name.strip())).resolve()  # glTF encodes names
         if not path.is_relative_to(folder):
             raise InputError(f"it names the file {shown(name)}, which does not lie beside it")
+        check_file(path)
         return without_mark(read_bytes(path, "file that a mesh names", MOST_BYTES))
 
 

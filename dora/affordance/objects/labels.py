@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from dora.digests import check_file
 from dora.errors import InputError, shown
 from dora.reading import read_array, read_json, read_text, read_yaml
 
@@ -130,6 +131,7 @@ def read_labels(path: Path, centers: Float[np.ndarray, "f 3"]) -> FaceLabels:
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"labels cannot be read from {path}: give a file ending in {', '.join(readers)}.")
+    check_file(path)
     return reader(path, centers)
 
 

@@ -16,7 +16,7 @@ import yaml
 from dora.agents.config import RunConfig, config_from_dict
 from dora.agents.evaluation.evaluate import Evaluation
 from dora.agents.limits import check
-from dora.agents.runs.stored_results import MOST_RESULT, with_digests
+from dora.agents.runs.stored_results import MOST_RESULT, OF_TABLES, with_digests
 from dora.configs import plain
 from dora.digests import SEAL, check_text, is_whole, with_checksum
 from dora.errors import InputError
@@ -205,7 +205,8 @@ class RunFolder:
             result = read_json(self.path / "result.json", "result", MOST_RESULT)
         except InputError:
             return None
-        return None if isinstance(result, dict) and SEAL in result and not is_whole(result) else result
+        changed = isinstance(result, dict) and (SEAL in result or OF_TABLES in result) and not is_whole(result)
+        return None if changed else result
 
     def write_config(self, config: RunConfig) -> None:
         """Write `config.yaml`, with its checksum."""

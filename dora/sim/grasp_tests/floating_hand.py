@@ -6,6 +6,7 @@ from sapien import physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder, LinkBuilder
 from sapien.wrapper.urdf_loader import URDFLoader
 
+from dora.digests import check_folder
 from dora.robot import RobotDescription
 from dora.sim.shapes import collision_shape
 
@@ -134,6 +135,7 @@ _SLIDE_TURNS = ((1.0, 0.0, 0.0, 0.0), (0.5**0.5, 0.0, 0.0, 0.5**0.5), (0.5**0.5,
 
 def _hand_builder(scene: sapien.Scene, robot: RobotDescription) -> ArticulationBuilder:
     """Builder of the wrist link and all links that it carries, with their inertias, without shapes."""
+    check_folder(robot.folder)
     loader = URDFLoader()
     loader.set_scene(scene)
     builder = loader.parse(str(robot.urdf))[0][0]
