@@ -1,13 +1,16 @@
 """Checksums of files that people write: what `sha256sum` wrote is compared, and all that is shipped has them."""
 
+import dataclasses
 import shutil
 import subprocess
 import time
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import sapien
+from mani_skill.agents.registration import REGISTERED_AGENTS
 
 from dora.affordance.objects.articulation import load_mount
 from dora.affordance.objects.catalogue import load_object
@@ -217,6 +220,17 @@ def test_a_robot_is_compared_whenever_it_is_used(tmp_path: Path):
     for use in (lambda: loading.load_robot(robot), lambda: _hand_builder(sapien.Scene([]), description)):
         with pytest.raises(InputError, match=r"robot\.urdf is not as its checksum"):
             use()
+
+
+def test_a_task_compares_its_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A process may live for days; the robot's description is of its start."""
+    robot = shutil.copytree(ROOT / "robots" / "diana7_hit", tmp_path / "robot")
+    sha256sum(robot, "*.toml *.urdf meshes/*.glb")
+    (robot / "meshes" / "palm.glb").write_bytes(b"glTF")
+    cls = REGISTERED_AGENTS["diana7_hit"].agent_cls
+    monkeypatch.setattr(cls, "description", dataclasses.replace(cls.description, folder=robot))
+    with pytest.raises(InputError, match=r"palm\.glb is not as its checksum"):
+        gym.make("DoraCube-v1")
 
 
 def test_a_text_with_a_checksum():
