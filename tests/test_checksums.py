@@ -192,8 +192,8 @@ def test_who_writes_a_folder_anew_renews_its_checksums(tmp_path: Path):
 
 def test_who_writes_a_file_vouches_for_no_other(tmp_path: Path):
     robot = shutil.copytree(ROOT / "robots" / "diana7_hit", tmp_path / "robot")
-    sha256sum(tmp_path, "robot/*.toml robot/*.urdf robot/*.yaml robot/meshes/*.glb")
     (robot / "robot.urdf").write_text("<robot/>")
+    sha256sum(tmp_path, "robot/*.toml robot/*.urdf robot/*.yaml robot/meshes/*.glb")
     (robot / "robot.toml").write_text(
         (robot / "robot.toml").read_text().replace("tip_radius = 0.0", "tip_radius = 0.00")
     )
