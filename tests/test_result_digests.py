@@ -58,6 +58,18 @@ def test_tables_of_a_run_that_goes_on_may_change(folder: Path):
     assert read_result(folder / "result.json") is None
 
 
+@pytest.mark.parametrize("dropped", [(), (SEAL,)], ids=["changed", "without its digest"])
+def test_a_changed_result_gets_no_digest_when_its_run_goes_on(folder: Path, dropped: tuple[str, ...]):
+    path = folder / "result.json"
+    content = json.loads(path.read_text()) | {"success_rate": 0.125}
+    path.write_text(json.dumps({name: value for name, value in content.items() if name not in dropped}))
+    changed = path.read_bytes()
+    RunFolder(folder).mark_unfinished()
+    assert path.read_bytes() == changed
+    with pytest.raises(InputError, match="its digest differs"):
+        read_result(path)
+
+
 def test_a_result_of_an_earlier_version_has_no_digest(folder: Path):
     path = folder / "result.json"
     content = json.loads(path.read_text())
