@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import sapien
-from mani_skill.agents.registration import REGISTERED_AGENTS
 
 from dora.affordance.objects.articulation import load_mount
 from dora.affordance.objects.catalogue import load_object
@@ -33,6 +32,7 @@ from dora.files import renew_checksums
 from dora.robot import loading
 from dora.robot.build import write_urdf
 from dora.sim.grasp_tests.floating_hand import _hand_builder
+from dora.sim.robots import register_robot
 
 ROOT = Path(__file__).parents[1]
 PLACES = (ROOT / "objects", ROOT / "robots")
@@ -227,7 +227,7 @@ def test_a_task_compares_its_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     robot = shutil.copytree(ROOT / "robots" / "diana7_hit", tmp_path / "robot")
     sha256sum(robot, "*.toml *.urdf meshes/*.glb")
     (robot / "meshes" / "palm.glb").write_bytes(b"glTF")
-    cls = REGISTERED_AGENTS["diana7_hit"].agent_cls
+    cls = register_robot("diana7_hit")
     monkeypatch.setattr(cls, "description", dataclasses.replace(cls.description, folder=robot))
     with pytest.raises(InputError, match=r"palm\.glb is not as its checksum"):
         gym.make("DoraCube-v1")
