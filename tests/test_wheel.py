@@ -68,6 +68,7 @@ def test_the_wheel_holds_policies_objects_robots_and_its_commit(wheel: Path) -> 
     for path in BUNDLED.iterdir():
         assert f"dora/policies/bundled/{path.name}" in names
     assert {"dora/_objects/hammer/object.toml", "dora/_robots/diana7_hit/robot.toml"} <= names
+    assert {"dora/_objects/SHA256SUMS", "dora/_robots/SHA256SUMS"} <= names
     assert not any(name.startswith(("tests/", "results/", "docs/")) for name in names)
     assert said["Name"] == PROJECT["name"]
     assert said["Version"] == dora.__version__
