@@ -217,6 +217,13 @@ def name_leftovers() -> None:
                 shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
+def remove_own() -> None:
+    """Remove the temporary folder of this process, where it ends without what Python does at the end."""
+    folder: Any = current_process()._config.get("tempdir")  # pyright: ignore[reportAttributeAccessIssue]
+    if folder and parent_process() is None and Path(folder).name.startswith(name_of_process()):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def _place_of_sockets() -> str:
     """Where this process may have a folder with the sockets of its workers, whose paths must not be long."""
     places = [os.path.abspath(tempfile.gettempdir()), "/tmp", "/var/tmp", "/dev/shm"]

@@ -200,6 +200,27 @@ if __name__ == "__main__":
 """
 
 
+ENDING = """
+import os, signal
+from dora.agents.runs.interrupt import ending_at_once
+from dora.parallel import name_leftovers, name_of_process
+if __name__ == "__main__":
+    with ending_at_once():
+        name_leftovers()
+        print(name_of_process(), flush=True)
+        os.kill(os.getpid(), signal.SIGINT)
+"""
+
+
+def test_a_command_that_ends_at_once_leaves_no_folder(tmp_path: Path):
+    """After it has named what its workers will use, and before it trains."""
+    (tmp_path / "ending.py").write_text(ENDING)
+    done = subprocess.run([sys.executable, str(tmp_path / "ending.py")], stdout=subprocess.PIPE, text=True)
+    assert done.returncode == 128 + signal.SIGINT
+    assert done.stdout.startswith("dora-")
+    assert not list(Path(tempfile.gettempdir()).glob(f"{done.stdout.strip()}*"))
+
+
 DOUBLING = """
 from dora.parallel import name_leftovers, run_cases
 def doubler():

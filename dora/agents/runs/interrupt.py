@@ -8,6 +8,8 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, NoReturn
 
+from dora.parallel import remove_own
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Signals that ask a run to end."""
 STATUS = 128
@@ -72,6 +74,7 @@ def ending_at_once() -> Iterator[None]:
 
 def _end(number: int, frame: FrameType | None) -> NoReturn:
     _say(NOTHING)
+    remove_own()
     os._exit(STATUS + number)
 
 

@@ -18,9 +18,9 @@ from dora.agents.evaluation.evaluate import Evaluation
 from dora.agents.limits import check
 from dora.agents.runs.stored_results import MOST_RESULT, OF_TABLES, with_digests
 from dora.configs import plain
-from dora.digests import SEAL, check_text, is_whole, with_checksum
+from dora.digests import SEAL, check_file, check_text, is_whole, with_checksum
 from dora.errors import InputError
-from dora.files import check_name, write_bytes, write_csv, write_json
+from dora.files import check_name, renew_checksums, write_bytes, write_csv, write_json
 from dora.reading import read_json, read_text, read_yaml
 from dora.version import VERSION, source_commit
 
@@ -210,7 +210,9 @@ class RunFolder:
 
     def write_config(self, config: RunConfig) -> None:
         """Write `config.yaml`, with its checksum."""
-        write_bytes(self.path / "config.yaml", with_checksum(yaml.safe_dump(plain(config), sort_keys=False)).encode())
+        path = self.path / "config.yaml"
+        write_bytes(path, with_checksum(yaml.safe_dump(plain(config), sort_keys=False)).encode())
+        renew_checksums([path])
 
     def read_config(self) -> RunConfig:
         """Settings of the run.
@@ -227,6 +229,7 @@ class RunFolder:
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         check_text(read_text(path, "file of settings"), path)
+        check_file(path)
         return config
 
     def write_curve(self, rows: list[list[Any]]) -> None:
