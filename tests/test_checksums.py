@@ -187,6 +187,7 @@ def test_who_writes_a_folder_anew_renews_its_checksums(tmp_path: Path):
     write_object_folder(load_object("hammer"), folder)
     check_folder(folder)
     assert set(listed_checksums(folder / SUMS)) == {"object.toml", *(path.name for path in folder.glob("*.ply"))}
+    subprocess.run(["sha256sum", "--check", "--quiet", "--strict", SUMS], check=True, cwd=folder)
     assert read_object_folder(folder).mass != jug.mass
 
 
