@@ -200,6 +200,15 @@ if __name__ == "__main__":
 """
 
 
+def test_a_run_that_was_archived_with_checksums_goes_on(tmp_path: Path):
+    """A larger budget is written, and with it the checksum of the settings."""
+    folder = RunFolder(tmp_path)
+    folder.create(SHORT)
+    subprocess.run("sha256sum config.yaml > SHA256SUMS", shell=True, check=True, cwd=tmp_path)
+    folder.write_config(dataclasses.replace(SHORT, total_steps=2 * SHORT.total_steps))
+    assert folder.read_config().total_steps == 2 * SHORT.total_steps
+
+
 ENDING = """
 import os, signal
 from dora.agents.runs.interrupt import ending_at_once
