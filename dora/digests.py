@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from dora.errors import InputError
+from dora.reading import read_bytes
 
 KEY = "digest_key"
 """Key of a field's metadata whose value replaces the field's name in digests, so that it can be renamed."""
@@ -150,14 +151,7 @@ def lines_of_checksums(sums: Path) -> list[str]:
     Raises:
         InputError: it is too large or cannot be read.
     """
-    try:
-        with sums.open("rb") as stream:
-            content = stream.read(MOST_SUMS + 1)
-    except OSError as error:
-        raise InputError(f"{sums} cannot be read ({error.strerror}): check its permissions, or remove it.") from error
-    if len(content) > MOST_SUMS:
-        raise InputError(f"{sums} has more than {MOST_SUMS} bytes: keep the lines of the files that are needed.")
-    return os.fsdecode(content).split("\n")
+    return os.fsdecode(read_bytes(sums, "file of checksums", MOST_SUMS)).split("\n")
 
 
 def parsed_checksum(line: str) -> tuple[str, str] | None:

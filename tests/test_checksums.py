@@ -166,7 +166,7 @@ def test_a_large_file_of_checksums_is_refused_where_it_belongs(tmp_path: Path):
         path.write_text("a")
     check_file(tmp_path / "below" / "a.txt")
     check_folder(tmp_path / "below")
-    with pytest.raises(InputError, match="more than 1000000 bytes"):
+    with pytest.raises(InputError, match="a file of checksums may have at most 1000000"):
         check_file(tmp_path / "a.txt")
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 LEVELS = {
-    "errors": 0, "version": 0, "quiet_start": 0, "digests": 0.3, "reading": 0.4, "arguments": 0.5, "configs": 0.5,
+    "errors": 0, "version": 0, "quiet_start": 0, "reading": 0.4, "digests": 0.45, "arguments": 0.5, "configs": 0.5,
     "containers": 0.5, "files": 0.5, "parallel": 0.5, "progress": 0.5, "tables": 0.5,
     "geometry": 1, "robot": 2, "robot.motion": 3,
     "affordance.objects": 4, "affordance.hand": 5, "affordance.maps": 6, "affordance": 7, "affordance.search": 8,

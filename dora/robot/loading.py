@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import dora
-from dora.digests import check_folder
+from dora.digests import check_file, check_folder
 from dora.errors import InputError, shown, suggestion
 from dora.reading import Table, TomlTables, entries, read_toml
 from dora.robot.description import Contact, Coupling, Finger, JointGroup, Posture, RobotDescription
@@ -84,6 +84,7 @@ def load_robot(name_or_folder: str | Path) -> RobotDescription:
 @cache
 def _load(folder: Path) -> RobotDescription:
     path = folder / ROBOT_FILE
+    check_file(path)
     content = read_toml(path, "file about a robot")
     urdf = content.get("urdf", "robot.urdf")
     if not isinstance(urdf, str) or not urdf.isprintable() or not (folder / urdf).resolve().is_relative_to(folder):

@@ -12,6 +12,7 @@ import numpy as np
 
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.configs import built
+from dora.digests import check_file
 from dora.errors import InputError, shown
 from dora.reading import read_toml
 from dora.robot.shapes import Shape
@@ -148,6 +149,7 @@ def load_mount(obj: AffordanceObject) -> Mount:
 @functools.cache
 def _read(path: Path, time: int) -> Mount:
     """The mount of a file as it was at a time of its last change."""
+    check_file(path)
     content = read_toml(path, "file about what an object is mounted on")
     if content.get("format") != FORMAT:
         found = shown(content.get("format"))

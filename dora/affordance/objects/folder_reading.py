@@ -26,6 +26,7 @@ from dora.affordance.objects.importing import LARGEST, SMALLEST
 from dora.affordance.objects.mesh_files import LABEL, read_ply
 from dora.affordance.objects.surfaces.weighing import MASSES
 from dora.containers import MOST_FACES
+from dora.digests import check_file
 from dora.errors import InputError, shown
 from dora.reading import Table, TomlTables, check_size, read_toml
 from dora.robot.shapes import Shape
@@ -88,6 +89,7 @@ class _Reader:
         """The tables of the file, with known keys alone."""
         if not os.path.isfile(self.path):
             raise InputError(f"{self.folder} has no {OBJECT_FILE}; give the folder of an object.")
+        check_file(self.path)
         content = read_toml(self.path, "file about an object")
         for key in RESERVED:
             if key in content:

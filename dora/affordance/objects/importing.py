@@ -197,6 +197,14 @@ class _Neighbours(FilePathResolver):
     """Files that a mesh file names, without byte order marks: plain ones of bounded size, in its folder or below."""
 
     def get(self, name: str) -> bytes:
+        """Content of a file that a mesh file names; trimesh calls it.
+
+        Args:
+            name: path of the file from the folder of the mesh, percent-encoded or not.
+
+        Raises:
+            InputError: it lies elsewhere, is missing, too large, or not as its checksum says.
+        """
         folder = Path(str(self.parent)).resolve()
         plain = folder / name.strip()
         path = (plain if os.path.lexists(plain) else folder / unquote(name.strip())).resolve()  # glTF encodes names
