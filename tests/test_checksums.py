@@ -223,6 +223,14 @@ def test_a_robot_is_compared_whenever_it_is_used(tmp_path: Path):
             use()
 
 
+def test_a_robots_own_file_of_one_checksum_is_compared(tmp_path: Path):
+    robot = shutil.copytree(ROOT / "robots" / "diana7_hit", tmp_path / "robot")
+    sha256sum(robot, "robot.toml", "robot.toml.sha256")
+    (robot / "robot.toml").write_text((robot / "robot.toml").read_text() + "# a remark\n")
+    with pytest.raises(InputError, match=r"robot\.toml is not as its checksum in .*robot\.toml\.sha256 says"):
+        loading.load_robot(robot)
+
+
 def test_a_task_compares_its_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A process may live for days; the robot's description is of its start."""
     robot = shutil.copytree(ROOT / "robots" / "diana7_hit", tmp_path / "robot")
