@@ -1,11 +1,16 @@
 """Films of policies: one palette, one size, the moments in which something happens; without a driver one sentence."""
 
 import io
+from pathlib import Path
 
 import numpy as np
+import pytest
 from pictures import run_without_driver
 from PIL import Image, ImageSequence
 
+from dora.agents.config import RunConfig
+from dora.commands import run
+from dora.errors import InputError
 from dora.policies.films import MOMENTS, RATE, SIDE, Episode, _small, as_gif, strip
 from dora.tools.stage_pictures import GAP
 
@@ -61,3 +66,17 @@ def test_without_a_driver_films_end_in_one_sentence(tmp_path):
     assert "No film: SAPIEN finds no Vulkan driver here" in result.stderr
     assert "Traceback" not in result.stderr
     assert not out.exists()
+
+
+def test_a_film_that_cannot_be_made_is_told_once_and_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def refuse(*args: object) -> None:
+        (tmp_path / "video").mkdir()
+        raise InputError("nothing can be rendered: there is no driver.")
+
+    monkeypatch.setattr(run, "record", refuse)
+    config = RunConfig("DoraCube-v1", "ppo", "none")
+    assert not run.film(None, config, tmp_path / "video" / "zero.mp4")
+    assert capsys.readouterr().err == "No video: nothing can be rendered: there is no driver.\n"
+    assert not (tmp_path / "video").exists()

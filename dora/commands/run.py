@@ -10,6 +10,7 @@ path is the last line printed. Ctrl-C saves; `--resume FOLDER` goes on. Every nu
 an option; the defaults that are shown are those of the task that --env names.
 """
 
+import contextlib
 import datetime
 import difflib
 import functools
@@ -316,7 +317,9 @@ def film(checkpoint: Path | None, config: RunConfig, path: Path, seed: int = FIN
         record(make_single_task, act, path, VIDEO_EPISODES, seed)
     except (RuntimeError, InputError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        print(f"No video: nothing can be rendered here ({reason}).", file=sys.stderr)
+        print(f"No video: {reason}", file=sys.stderr)
+        with contextlib.suppress(OSError):
+            path.parent.rmdir()  # nothing is in it, unless there is an earlier film
         return False
     return True
 
