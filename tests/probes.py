@@ -43,6 +43,7 @@ from dora.policies.card import Card
 from dora.policies.policy import bundled_files
 from dora.robot import loading, mirror, visuals
 from dora.robot.build import write_urdf
+from dora.tasks.hammer.finger_motion import TURNING_FILE, read_motion
 
 ROOT = Path(__file__).parents[1]
 ROBOT = ROOT / "robots" / "diana7_hit"
@@ -241,6 +242,16 @@ def load_mounted(folder: Path) -> Any:
     return load_mount(read_object_folder(folder / "microwave"))
 
 
+def write_turning(folder: Path) -> None:
+    hammer = catalogue.load_object("hammer").folder
+    assert hammer is not None
+    shutil.copy(hammer / TURNING_FILE, folder)
+
+
+def load_turning(folder: Path) -> Any:
+    return read_motion(folder / TURNING_FILE)
+
+
 def box() -> trimesh.Trimesh:
     return trimesh.creation.box((0.05, 0.06, 0.07))
 
@@ -334,6 +345,7 @@ LOADERS: dict[str, Loader] = {
     "visuals.yaml": Loader(write_visuals, visuals.write_meshes, ("visuals.yaml",)),
     "object.toml": Loader(write_object, load_object, ("object.toml",)),
     "articulation.toml": Loader(write_mounted, load_mounted, ("articulation.toml",)),
+    "turning.toml": Loader(write_turning, load_turning, ("turning.toml",)),
     "object meshes": Loader(write_object, load_object, ("*.ply",)),
     **{
         f"mesh .{end}": Loader(with_ending(write_mesh, end), with_ending(load_mesh, end))

@@ -33,6 +33,7 @@ from dora.robot import loading
 from dora.robot.build import write_urdf
 from dora.sim.grasp_tests.floating_hand import _hand_builder
 from dora.sim.robots import register_robot
+from dora.tasks.hammer.finger_motion import read_motion
 
 ROOT = Path(__file__).parents[1]
 PLACES = (ROOT / "objects", ROOT / "robots")
@@ -54,6 +55,8 @@ def load(folder: Path) -> None:
     found = read_object_folder(folder)
     if (folder / "articulation.toml").exists():
         load_mount(found)
+    if (folder / "turning.toml").exists():
+        read_motion(folder / "turning.toml")
 
 
 @pytest.mark.parametrize("place", PLACES, ids=lambda place: place.name)

@@ -39,7 +39,8 @@ def jug_state(**given: Tensor) -> Snapshot:
 def hammer_state(**given: Tensor) -> HammerSnapshot:
     fixed = {
         "nail_p": torch.zeros(2, 3), "nail_depth": torch.zeros(2), "nail_driven": torch.zeros(2),
-        "drift_p": torch.zeros(2), "drift_r": torch.zeros(2), "face": torch.tensor([[0.04, 0.0, 0.04]]).repeat(2, 1),
+        "drift_p": torch.zeros(2), "drift_r": torch.zeros(2), "turned": torch.zeros(2), "way": torch.zeros(2),
+        "face": torch.tensor([[0.04, 0.0, 0.04]]).repeat(2, 1),
         "butt": torch.tensor([[0.0, 0.0, -0.2]]).repeat(2, 1), "neck": torch.zeros(2, 3),
     }  # fmt: skip
     return extension(HammerSnapshot, 2, **(fixed | given))

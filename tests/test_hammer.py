@@ -18,7 +18,7 @@ from dora.geometry.rotations import (
 )
 from dora.tasks.hammer import mdp
 from dora.tasks.hammer.ballistics import Strike, after_fall, arrival, fall_time, slid
-from dora.tasks.hammer.reference import ALIGN, REST, SWING, CatchReference, CatchSettings, Timing, phases
+from dora.tasks.hammer.reference import CatchReference, CatchSettings, Timing, phases
 from dora.tasks.hammer.snapshot import HAND_CENTRE, HammerSnapshot, face_to_nail, handle_distance, misalignment
 from dora.tasks.hammer.task import UNKNOWN, HammerConfig, HammerTask
 
@@ -26,6 +26,8 @@ FACE = (0.04, 0.0, 0.04)
 CONFIG = HammerConfig()
 """The task's own numbers."""
 STAGES, TERMS = mdp.stages(CONFIG), mdp.terms(CONFIG).terms
+PHASES = [phase.name for phase in phases(CatchSettings())]
+ALIGN, SWING, REST = (PHASES.index(name) for name in ("align", "swing", "rest"))
 FLAT = quaternion_multiply(
     quaternion_from_rotation_vector(torch.tensor([0.0, pi / 2, 0.0])), torch.tensor([1.0, 0.0, 0.0, 0.0])
 )
@@ -40,7 +42,7 @@ def invented(n: int, **given: Tensor) -> HammerSnapshot:
         "neck": torch.tensor([0.0, 0.0, 0.04]).repeat(n, 1),
         "nail_p": torch.zeros(n, 3),
     }
-    still = dict.fromkeys(("nail_depth", "nail_driven", "drift_p", "drift_r"), torch.zeros(n))
+    still = dict.fromkeys(("nail_depth", "nail_driven", "drift_p", "drift_r", "turned", "way"), torch.zeros(n))
     return extension(HammerSnapshot, n, **(hammer | still | given))
 
 
@@ -234,9 +236,9 @@ def test_between_catch_and_blow_the_wrist_turns_the_hammer(learned: bool):
     for _ in range(task.max_steps):
         s = task.snapshot
         now = torch.stack([relative((s.hand.wrist_p, s.hand.wrist_q), (s.object.p, s.object.q))[1], s.object.q])
-        begins = (s.stage >= mdp.ORIENT) & before[0, :, 0].isnan()
+        begins = (s.stage >= mdp.HELD) & before[0, :, 0].isnan()
         before[:, begins] = now[:, begins]
-        ends = (s.stage >= mdp.STRIKE) & turned[0].isnan()
+        ends = (s.stage >= mdp.strike_stage(CONFIG)) & turned[0].isnan()
         turned[:, ends] = rotation_angle(before[:, ends].flatten(0, 1), now[:, ends].flatten(0, 1)).view(2, -1)
         observation = task.step(policy(observation))[0]
     in_hand, in_world = turned.nanmedian(-1).values.tolist()

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from dora.affordance.objects.catalogue import load_object
 from dora.tasks.cube import OBSERVATIONS as CUBE
+from dora.tasks.hammer.observations import OBSERVATIONS as HAMMER
 from dora.tasks.hammer.snapshot import HANDLE_RADIUS, HammerSnapshot
-from dora.tasks.hammer.task import OBSERVATIONS as HAMMER
 from dora.tasks.jug import OBSERVATIONS as JUG
 from dora.tasks.mdp.observations import ARM_ENTRIES, FASTEST_SPIN
 from dora.tasks.mdp.snapshot import Snapshot, extended
@@ -122,7 +122,9 @@ def hammer() -> HammerSnapshot:
     drift = {"drift_p": torch.tensor([0.04, 0.5, 0.0]), "drift_r": torch.tensor([0.3, 0.0, 7.0])}
     nail = {"nail_p": torch.randn(N, 3), "nail_depth": torch.tensor([0.0, 0.02, 0.05])}
     ends = {name: torch.randn(N, 3) for name in ("face", "butt", "neck")}
-    return extended(state(), HammerSnapshot, nail_driven=torch.tensor([0.0, 0.01, 0.03]), **nail, **drift, **ends)
+    turn = {"turned": torch.tensor([0.0, 0.7, -0.1]), "way": torch.tensor([1.0, -1.0, 1.0])}
+    driven = torch.tensor([0.0, 0.01, 0.03])
+    return extended(state(), HammerSnapshot, nail_driven=driven, **nail, **drift, **ends, **turn)
 
 
 def from_handle(s: HammerSnapshot) -> np.ndarray:

@@ -45,7 +45,7 @@ def jug_state(**given: Tensor) -> Any:
 
 def hammer_state(**given: Tensor) -> Any:
     ends = {name: torch.tensor([[0.0, 0.0, z]]).repeat(2, 1) for name, z in (("butt", -0.2), ("neck", 0.0))}
-    still = dict.fromkeys(("nail_depth", "nail_driven", "drift_p", "drift_r"), torch.zeros(2))
+    still = dict.fromkeys(("nail_depth", "nail_driven", "drift_p", "drift_r", "turned", "way"), torch.zeros(2))
     fixed = {"face": torch.tensor([[0.04, 0.0, 0.04]]).repeat(2, 1), "nail_p": torch.zeros(2, 3)}
     return extension(HammerSnapshot, 2, **(ends | still | fixed | given))
 

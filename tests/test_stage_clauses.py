@@ -133,7 +133,8 @@ def hammer_state(
     wrist = p + side - torch.tensor([HAND_CENTRE])
     fixed = {
         "nail_p": torch.zeros(1, 3), "nail_depth": torch.zeros(1), "nail_driven": torch.tensor([driven]),
-        "drift_p": torch.tensor([drift[0]]), "drift_r": torch.tensor([drift[1]]), "face": point,
+        "drift_p": torch.tensor([drift[0]]), "drift_r": torch.tensor([drift[1]]), "turned": torch.zeros(1),
+        "way": torch.ones(1), "face": point,
         "butt": at(0.0, 0.0, -0.2), "neck": torch.zeros(1, 3), "object_p": p, "object_q": q, "wrist_p": wrist,
         "wrist_v": at(carried, 0.0, 0.0), "object_v": at(carried + speed, 0.0, 0.0),
         "touch": touching(0, 1) if touch is None else touch,

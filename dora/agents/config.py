@@ -128,8 +128,10 @@ class SACConfig:
     """Widths of the hidden layers of actor and critics."""
 
 
-NEUTRAL = {"definition": 1, "arm_effort": 1.0, "pose_filter": 1.0, "placed_after_overlap": 0.0}
+NEUTRAL = {"definition": 1, "arm_effort": 1.0, "pose_filter": 1.0, "placed_after_overlap": 0.0, "reorient": "wrist"}
 """Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
+WITHOUT_EFFECT = {"turn": ("reorient", "wrist")}
+"""The same of numbers that change nothing while another one has such a value."""
 UNUSED = {"reward": "dense", "after_success": None}
 """The same of settings of the run."""
 CONSTANT_PULL = {"prior_last": None, "prior_steps": 100_000}
@@ -218,7 +220,9 @@ class RunConfig(Generic[Numbers, Settings, Agent]):
 def _digested(content: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that enter a digest."""
     left_out = {"total_steps"} | {name for name, value in UNUSED.items() if content.get(name) == value}
-    task = {name: value for name, value in content.get("task", {}).items() if NEUTRAL.get(name) != value}
+    numbers = content.get("task", {})
+    idle = {name for name, (other, value) in WITHOUT_EFFECT.items() if numbers.get(other, value) == value}
+    task = {name: value for name, value in numbers.items() if NEUTRAL.get(name) != value and name not in idle}
     neutral, learner = NEUTRAL_LEARNER.get(content.get("agent", ""), {}), content.get("learner", {})
     learner = {name: value for name, value in learner.items() if neutral.get(name) != value}
     kept = {name: value for name, value in content.items() if name not in left_out}

@@ -79,10 +79,10 @@ def _meanings(config: Any) -> dict[str, Any]:
 
 
 def _text(value: Any) -> str:
-    """A number, a switch or several numbers, as they are written on the command line."""
+    """A number, a switch, a name or several of them, as they are written on the command line."""
     if isinstance(value, list):
         return ", ".join(map(_text, value))
-    return str(value) if isinstance(value, bool) else f"{value:g}"
+    return str(value) if isinstance(value, bool | str) else f"{value:g}"
 
 
 TABLES = {

@@ -19,6 +19,7 @@ from dora.affordance.candidates import GraspCandidates
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.feasibility_table import ReachTable
 from dora.errors import InputError
+from dora.robot import RobotDescription
 from dora.sim.actors import build_object
 from dora.sim.properties import ObjectProperties
 from dora.sim.robot_agent import DescribedRobot
@@ -51,6 +52,7 @@ class TaskScene:
     Attributes:
         table: the table, whose upper face is z = 0.
         objects, arms: by name; an object is an actor, or a link of what it is mounted on.
+        robots: descriptions of the arms' robots by name, before `Task.make_reference` is asked.
         halves: half extents of each object's bounding box (n, 3) [m].
         reader: reads the simulator.
     """
@@ -69,6 +71,7 @@ class TaskScene:
         self.objects: dict[str, Any] = {}
         self.halves: dict[str, Float[Tensor, "n 3"]] = {}
         self._properties: dict[str, ObjectProperties] = {}
+        self.robots: dict[str, RobotDescription] = {}
         self.arms = ArmGroup()
         self.reader: StateReader
 
@@ -123,6 +126,7 @@ class TaskScene:
             InputError: candidates are of another object or hand than the arm's, or none of them is valid.
         """
         region = REGION in parts or not parts
+        self.robots = {name: agent.description for name, agent in zip(task.ARMS, agents, strict=True)}
         for (name, spec), agent in zip(task.ARMS.items(), agents, strict=True):
             given = grasps.get(name)
             adapted = _fitting(task, name, agent, task.candidates(name, region) if given is None else given)

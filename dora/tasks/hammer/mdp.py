@@ -25,8 +25,13 @@ from dora.tasks.mdp.terms import at_candidate, near_region, paper_affordance, pa
 if TYPE_CHECKING:
     from dora.tasks.hammer.task import HammerConfig
 
-CATCH, STABILISE, ORIENT, STRIKE = range(4)
-"""Indices of the stages."""
+CATCH, STABILISE, HELD = range(3)
+"""Indices of the first stages, and of the one in which the hammer is held."""
+
+
+def strike_stage(c: "HammerConfig") -> int:
+    """Index of the last stage."""
+    return HELD + 1 + c.in_hand_turn
 
 
 def stages(c: "HammerConfig") -> list[Stage[HammerSnapshot]]:
@@ -38,8 +43,12 @@ def stages(c: "HammerConfig") -> list[Stage[HammerSnapshot]]:
     def still(s: HammerSnapshot) -> Tensor:
         return in_hand(s, c) & (s.drift_p < c.still[0]) & (s.drift_r < c.still[1])
 
+    def turned(s: HammerSnapshot) -> Tensor:
+        return in_hand(s, c) & (s.turned >= c.turn.least)
+
     def oriented(s: HammerSnapshot) -> Tensor:
-        return in_hand(s, c) & (misalignment(s) < c.aligned) & above_nail(s, c)
+        enough = s.turned >= c.turn.least if c.in_hand_turn else torch.ones_like(s.turned, dtype=torch.bool)
+        return in_hand(s, c) & (misalignment(s) < c.aligned) & above_nail(s, c) & enough
 
     def lost(s: HammerSnapshot) -> Tensor:
         return off_centre(s) > c.lost
@@ -50,6 +59,7 @@ def stages(c: "HammerConfig") -> list[Stage[HammerSnapshot]]:
     return [
         Stage("catch", caught, hold=c.caught_time),
         Stage("stabilise", still, lost=lost, back_to="catch"),
+        *([Stage("turn", turned, hold=c.turn.hold_time, lost=lost, back_to="catch")] if c.in_hand_turn else []),
         Stage("orient", oriented, hold=c.hold_time, lost=lost, back_to="catch"),
         Stage("strike", driven, lost=lost, back_to="catch"),
     ]
@@ -58,16 +68,21 @@ def stages(c: "HammerConfig") -> list[Stage[HammerSnapshot]]:
 def terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
     """The reward."""
     w, limit = c.weights, f"{1000 * c.penetration_limit:g} mm"
+    strikes = strike_stage(c)
 
     def catch(s: HammerSnapshot) -> Tensor:
         return tolerance(off_centre(s), (0.0, 0.02), 0.3) * (0.5 + 0.1 * fingers_on(s))
 
     def still(s: HammerSnapshot) -> Tensor:
-        return torch.where(s.stage > STRIKE, 1.0, steadiness(s, c))
+        return torch.where(s.stage > strikes, 1.0, steadiness(s, c))
+
+    def turn(s: HammerSnapshot) -> Tensor:
+        share = (s.turned / c.turn.least).clamp(0, 1)
+        return torch.where(s.stage > strikes, 1.0, (in_hand(s, c) & (s.stage >= HELD)) * share)
 
     def orient(s: HammerSnapshot) -> Tensor:
-        held = in_hand(s, c) & (s.stage >= ORIENT)
-        return torch.where(s.stage > STRIKE, 1.0, held * poise(s))
+        held = in_hand(s, c) & (s.stage >= strikes - 1)
+        return torch.where(s.stage > strikes, 1.0, held * poise(s))
 
     def clean(s: HammerSnapshot) -> Tensor:
         return (s.max_penetration <= c.penetration_limit).float()
@@ -76,7 +91,7 @@ def terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
         return driven_share(s, c) * (c.after_overlap + (1 - c.after_overlap) * clean(s))
 
     def driven(s: HammerSnapshot) -> Tensor:
-        return ((s.nail_driven >= c.nail.driven) & (s.stage > STRIKE)).float() * clean(s)
+        return ((s.nail_driven >= c.nail.driven) & (s.stage > strikes)).float() * clean(s)
 
     return Terms(
         {
@@ -85,11 +100,12 @@ def terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
                 "exp(-alpha * sum of fingertip distances to the handle)", region=True,
             ),
             "candidate": Term(
-                lambda s: at_candidate(s, s.stage >= ORIENT), w.candidate, "task", True,
+                lambda s: at_candidate(s, s.stage >= HELD), w.candidate, "task", True,
                 "closeness of the wrist to the candidate until the hammer is held",
             ),
             "catch": Term(catch, w.catch, doc="handle near the middle of the hand, and fingers on it"),
             "still": Term(still, w.still, doc="the hammer does not move in the hand"),
+            **({"turn": Term(turn, c.turn.weight, doc="share of the turn in the hand")} if c.in_hand_turn else {}),
             "orient": Term(
                 orient, w.orient,
                 doc="closeness of theta, the angle from striking axis to nail axis, and of the face to the nail",
@@ -111,9 +127,9 @@ def paper_terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
     return Terms(
         {
             **paper_affordance(lambda s: s.object.p + (s.butt + s.neck) / 2),
-            **paper_grasp(ORIENT),
+            **paper_grasp(HELD),
             "orient": Term(
-                lambda s: (1 - misalignment(s) / pi) * (s.stage >= ORIENT),
+                lambda s: (1 - misalignment(s) / pi) * (s.stage >= strike_stage(c) - 1),
                 1.0,
                 doc="1 - theta / pi, theta: angle from striking axis to nail axis",
             ),

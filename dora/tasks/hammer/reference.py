@@ -24,6 +24,7 @@ from dora.geometry.rotations import (
 from dora.tasks.guidance.reference import Reference
 from dora.tasks.guidance.residual_action import Target
 from dora.tasks.hammer.ballistics import Strike, after_fall, arrival, slid
+from dora.tasks.hammer.finger_motion import FingerMotion
 from dora.tasks.hammer.reach import REACH, TURN
 from dora.tasks.hammer.snapshot import HammerSnapshot
 from dora.tasks.mdp.stages import Stage
@@ -103,12 +104,19 @@ class Timing:
     driven: Bool[Tensor, " n"]
 
 
-WAIT, CLOSE, SETTLE, ALIGN, RAISING, SWING, REST = range(7)
-"""Indices of the phases."""
+TURNED_TIME = 0.15
+"""How long the hand keeps still after the fingers have turned the hammer in it [s]."""
+WAIT, CLOSE, SETTLE = range(3)
+"""Indices of the first phases."""
 
 
-def phases(c: CatchSettings) -> list[Stage[Timing]]:
-    """The phases, in order."""
+def phases(c: CatchSettings, turning: float | None = None) -> list[Stage[Timing]]:
+    """The phases, in order.
+
+    Args:
+        c: numbers of the reference.
+        turning: how long the fingers turn the hammer in the hand [s]; None if they do not.
+    """
 
     def there(t: Timing) -> Tensor:
         return ((t.position < c.arrived[0]) & (t.angle < c.arrived[1])) | (t.spent > c.patience)
@@ -120,6 +128,7 @@ def phases(c: CatchSettings) -> list[Stage[Timing]]:
         Stage("wait", lambda t: t.arrival <= c.lead),
         Stage("close", lambda t: t.spent >= c.close_time),
         Stage("settle", lambda t: t.spent >= c.settle_time),
+        *([] if turning is None else [Stage("turn", lambda t: t.spent >= turning + TURNED_TIME)]),
         Stage("align", lambda t: there(t) & (t.spent >= c.align_time), hold=c.aligned_time),
         Stage("raise", there, hold=c.raised_time),
         Stage("swing", lambda t: struck(t) & t.driven, lost=lambda t: struck(t) & ~t.driven, back_to="raise"),
@@ -137,6 +146,7 @@ class CatchReference(Reference):
         dt: duration of a control step [s].
         device: of all tensors.
         settings: numbers of the reference.
+        motion: with which the fingers turn the caught hammer; None if they do not.
     """
 
     def __init__(
@@ -147,14 +157,17 @@ class CatchReference(Reference):
         dt: float,
         device: torch.device | str,
         settings: CatchSettings | None = None,
+        motion: FingerMotion | None = None,
     ):
-        self.settings = settings or CatchSettings()
+        self.settings, self.motion = settings or CatchSettings(), motion
+        turning: dict[str, tuple[int, ...]] = {} if motion is None else {"offset": motion.positive.shape[1:]}
         super().__init__(
-            phases(self.settings), num_envs, dt, device,
+            phases(self.settings, None if motion is None else motion.seconds), num_envs, dt, device, **turning,
             home_p=(3,), home_q=(4,), lead_p=(3,), lead_q=(4,), grasped_p=(3,), grasped_q=(4,),
             spent=(), sinking=(), depth=(),
         )  # fmt: skip
         self.strike, self._driven = strike, driven
+        self._index = {phase.name: k for k, phase in enumerate(self.phase.stages)}
         self._reach = torch.tensor([*REACH, 0.0], device=device)
         for name in ("home_q", "lead_q", "grasped_q"):
             getattr(self.buffers, name)[:, 0] = 1.0
@@ -165,11 +178,17 @@ class CatchReference(Reference):
             rows, home_p=wrist_p, home_q=wrist_q, lead_p=wrist_p, lead_q=wrist_q,
             grasped_p=0.0, spent=0.0, sinking=0.0, depth=0.0,
         )  # fmt: skip
+        if self.motion is not None:
+            self.buffers.write(rows, offset=0.0)
         self.phase.reset(rows)
 
     def freedom(self) -> Float[Tensor, " n"]:
-        """All of the residual while the hammer is caught, less from then on."""
-        return torch.where(self.phase.index <= SETTLE, 1.0, self.settings.held_freedom)
+        """All of the residual until the hammer is held as it shall be, less from then on."""
+        return torch.where(self.phase.index < self._index["align"], 1.0, self.settings.held_freedom)
+
+    def _in(self, *names: str) -> Bool[Tensor, " n"]:
+        """Which environments are in one of these phases."""
+        return torch.isin(self.phase.index, torch.tensor([self._index[n] for n in names], device=self._reach.device))
 
     def _arrival(self, s: HammerSnapshot) -> Tensor:
         """Time (n,) until the candidate comes down to the height at which the fingers are to hold it [s]."""
@@ -202,47 +221,54 @@ class CatchReference(Reference):
         waits = (phase == WAIT)[:, None]
         opened = waits | ((phase == CLOSE) & (b.spent < self.settings.finger_lag))[:, None]
         position, quaternion = self._meeting(s, b.home_p[:, 2])
+        closed = s.goal.grasp if self.motion is None else s.goal.grasp + b.offset
         return Target(
             torch.where(waits, position, b.lead_p),
             torch.where(waits, quaternion, b.lead_q),
-            torch.where(opened, s.goal.pregrasp, s.goal.grasp),
+            torch.where(opened, s.goal.pregrasp, closed),
         )
 
     def advance(self, s: HammerSnapshot) -> None:
         """Moves phase, measurement and lead on, once per control step."""
         b, c, before = self.buffers, self.settings, self.phase.index.clone()
-        self._measure(s, before)
+        self._measure(s)
         b.update(spent=b.spent + self.dt)
-        goal = self._carried_to(before)
+        goal = self._carried_to()
         error = (goal[0] - s.hand.wrist_p).norm(dim=-1), rotation_angle(goal[1], s.hand.wrist_q)
         self.phase.advance(Timing(self._arrival(s), b.spent, *error, s.nail_driven >= self._driven))
         now = self.phase.index
         b.spent.masked_fill_(now != before, 0.0)
         lead = b.lead_p, b.lead_q
-        carried = slew(lead, self._carried_to(now), c.carry_speed * self.dt, c.carry_spin * self.dt)
+        self._bend(s)
+        carried = slew(lead, self._carried_to(), c.carry_speed * self.dt, c.carry_spin * self.dt)
         for phases, (position, quaternion) in (
-            ((WAIT,), self._meeting(s, b.home_p[:, 2])),
-            ((CLOSE,), self._sinking(s, lead)),
-            ((ALIGN, RAISING, REST), carried),
-            ((SWING,), self._wrist(self._swung(), -c.through)),
+            (("wait",), self._meeting(s, b.home_p[:, 2])),
+            (("close",), self._sinking(s, lead)),
+            (("align", "raise", "rest"), carried),
+            (("swing",), self._wrist(self._swung(), -c.through)),
         ):
-            here = torch.isin(now, torch.tensor(phases, device=now.device))[:, None]
+            here = self._in(*phases)[:, None]
             b.lead_p.copy_(torch.where(here, position, b.lead_p))
             b.lead_q.copy_(torch.where(here, quaternion, b.lead_q))
 
-    def _carried_to(self, phase: Tensor) -> Pose:
-        """Wrist pose to which the hammer is carried in a phase: low over the nail, raised for a blow, or at rest."""
-        c = self.settings
-        raised = c.raised * (phase == RAISING)
-        gap = torch.where(phase == RAISING, -c.through, torch.where(phase == REST, 2 * c.gap, c.gap))
-        return self._wrist(raised, gap)
+    def _bend(self, s: HammerSnapshot) -> None:
+        """Moves the fingers that turn the hammer in the hand on."""
+        if self.motion is not None:
+            moved = self.motion.offsets(self.buffers.spent, s.way)
+            self.buffers.update(offset=torch.where(self._in("turn")[:, None], moved, self.buffers.offset))
 
-    def _measure(self, s: HammerSnapshot, phase: Tensor) -> None:
+    def _carried_to(self) -> Pose:
+        """Wrist pose to which the hammer is carried now: low over the nail, raised for a blow, or at rest."""
+        c, raising = self.settings, self._in("raise")
+        gap = torch.where(raising, -c.through, torch.where(self._in("rest"), 2 * c.gap, c.gap))
+        return self._wrist(c.raised * raising, gap)
+
+    def _measure(self, s: HammerSnapshot) -> None:
         """Follows the hammer's pose in the hand: at once while it is caught, smoothly after, not while it strikes;
         and the nail's depth, not while it is struck, or the blow would become a push."""
-        b = self.buffers
-        b.depth.copy_(torch.where(phase == SWING, b.depth, s.nail_depth))
-        share = torch.where(phase <= CLOSE, 1.0, torch.where(phase == SWING, 0.0, self.settings.memory))
+        b, swings = self.buffers, self._in("swing")
+        b.depth.copy_(torch.where(swings, b.depth, s.nail_depth))
+        share = torch.where(self._in("wait", "close"), 1.0, torch.where(swings, 0.0, self.settings.memory))
         seen = relative((s.hand.wrist_p, s.hand.wrist_q), (s.object.p, s.object.q))
         grasped_p, grasped_q = blend((b.grasped_p, b.grasped_q), seen, share)
         b.grasped_p.copy_(grasped_p)

@@ -27,6 +27,9 @@ class HammerSnapshot(Snapshot):
         nail_driven: how far it has been driven by blows [m].
         drift_p, drift_r: how far the hammer has moved in the hand within the last moments [m], [rad]; large before they
             are over.
+        turned: by how much the fingers have turned the hammer about its handle since it was held still, relative to the
+            palm and towards the blow [rad]; 0 before.
+        way: 1 or -1, about which direction of the handle that is; 0 where the wrist re-orients the hammer.
         face: centre of the striking face, hammer frame [m].
         butt, neck: ends of the handle's axis, hammer frame [m].
     """
@@ -36,6 +39,8 @@ class HammerSnapshot(Snapshot):
     nail_driven: Float[Tensor, " n"]
     drift_p: Float[Tensor, " n"]
     drift_r: Float[Tensor, " n"]
+    turned: Float[Tensor, " n"]
+    way: Float[Tensor, " n"]
     face: Float[Tensor, "n 3"]
     butt: Float[Tensor, "n 3"]
     neck: Float[Tensor, "n 3"]

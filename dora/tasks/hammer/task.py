@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from math import pi
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import sapien
@@ -29,30 +29,31 @@ from dora.tasks.env.starts import ChosenStarts, StartNumber
 from dora.tasks.env.task import HAND_CAMERA, Task
 from dora.tasks.guidance.reference import Reference
 from dora.tasks.hammer.ballistics import Strike
-from dora.tasks.hammer.mdp import STRIKE, failed, in_hand, paper_terms, stages, terms
+from dora.tasks.hammer.finger_motion import load_motion
+from dora.tasks.hammer.mdp import HELD, failed, in_hand, paper_terms, stages, strike_stage, terms
 from dora.tasks.hammer.nail import Nail, NailSettings, drawn_links
+from dora.tasks.hammer.observations import OBSERVATIONS, TURN_OBSERVATIONS
 from dora.tasks.hammer.reach import with_waiting_hand, within_reach
 from dora.tasks.hammer.reference import CatchReference, CatchSettings
-from dora.tasks.hammer.snapshot import (
-    HammerSnapshot,
-    face_to_nail,
-    fingers_on,
-    handle_axis,
-    nail_in_hand,
-    striking_axis,
-    tip_distance,
+from dora.tasks.hammer.snapshot import HammerSnapshot, fingers_on
+from dora.tasks.hammer.turning import (
+    TurnSettings,
+    number_of_roll,
+    roll_at_release,
+    turn_about_handle,
+    turned_copies,
 )
 from dora.tasks.mdp.buffers import Buffers
 from dora.tasks.mdp.config import PenaltyWeights, TaskConfig
 from dora.tasks.mdp.mdp import Mdp
-from dora.tasks.mdp.observations import Entry
-from dora.tasks.mdp.quantities import turned_in_wrist
 from dora.tasks.mdp.snapshot import Snapshot, extended
 
 CLASS = "HandleGrasp"
 """The grasp class that the task asks for."""
 UNKNOWN = 1e3
 """Motion in the hand before the window is full [m]."""
+ROLL = 5
+"""Which of the random numbers of a start is the turn about the handle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,6 +130,11 @@ class HammerConfig(TaskConfig):
     """Overlap that costs no reward [m]."""
     after_overlap: float = 0.3
     """Share of what blows earn that is left once an overlap was above the limit [1]."""
+    reorient: Literal["wrist", "in_hand"] = "wrist"
+    """What re-orients the caught hammer: the wrist alone, or first the fingers, for which it arrives turned about its
+    handle."""
+    turn: TurnSettings = field(default_factory=TurnSettings)
+    """Numbers of the re-orientation in the hand."""
     swing_radius: float = 0.36
     """Distance of the swing's axis from the nail [m]."""
     fewest_catches: float = 0.55
@@ -142,6 +148,11 @@ class HammerConfig(TaskConfig):
     """Numbers of the reference."""
     weights: HammerWeights = field(default_factory=HammerWeights)
     """Weights of the reward terms."""
+
+    @property
+    def in_hand_turn(self) -> bool:
+        """Whether the fingers re-orient the hammer."""
+        return self.reorient == "in_hand"
 
 
 @register_task("DoraHammer-v1")
@@ -189,10 +200,14 @@ class HammerTask(Task):
     """Centre of the striking face, and ends of the handle's axis, in the hammer's frame [m]."""
     history: Buffers
     """Poses of the hammer in the hand within the window."""
+    turning: Buffers
+    """Orientation of the hammer in the hand when it was held still (`held`), and which way the fingers turn it
+    (`way`)."""
 
     def make_mdp(self, scene: TaskScene) -> Mdp[HammerSnapshot]:
         c: HammerConfig = self.config
-        judged = stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS, partial(failed, c=c)
+        entries = OBSERVATIONS | (TURN_OBSERVATIONS if c.in_hand_turn else {})
+        judged = stages(c), terms(c), paper_terms(c), c.penetration_limit, entries, partial(failed, c=c)
         return Mdp(*judged, "the hammer has fallen")
 
     def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
@@ -203,8 +218,11 @@ class HammerTask(Task):
         return (fingers_on(s) >= 2) & (s.object.p[:, 2] > self.config.fallen)
 
     def adapted(self, candidates: GraspCandidates, arm: str, robot: RobotDescription) -> GraspCandidates:
-        """The hand waits wide open, in the posture in which the arm starts."""
-        return with_waiting_hand(candidates, robot, start_posture(self.ARMS[arm]))
+        """The hand waits wide open, in the posture in which the arm starts; for a hammer that arrives turned also with
+        grasps that are turned against that."""
+        c: HammerConfig = self.config
+        wanted = turned_copies(candidates, handle_place(), c.turn) if c.in_hand_turn else candidates
+        return with_waiting_hand(wanted, robot, start_posture(self.ARMS[arm]))
 
     def reachable(
         self, arm: Arm, rows: Int[Tensor, " b"], object_p: Float[Tensor, "b 3"], object_q: Float[Tensor, "b 4"]
@@ -215,13 +233,13 @@ class HammerTask(Task):
     def make_reference(self, scene: TaskScene, arm: str) -> Reference:
         c: HammerConfig = self.config
         strike = Strike(torch.tensor(c.nail.top, device=scene.device), self.points["face"], c.swing_radius)
-        return CatchReference(scene.num_envs, strike, c.nail.driven, c.dt, scene.device, c.reference)
+        motion = load_motion(self.ARMS[arm].object, scene.robots[arm]) if c.in_hand_turn else None
+        return CatchReference(scene.num_envs, strike, c.nail.driven, c.dt, scene.device, c.reference, motion)
 
     def build(self, scene: TaskScene, name: str, scale: Float[np.ndarray, " n"]) -> Actor:
         """Hammer and nail."""
         c, hammer = self.config, load_object(name)
-        handle = hammer.region("handle").bounds
-        x, y = handle.mean(0)[:2]
+        handle, (x, y) = hammer.region("handle").bounds, handle_place()
         factor = torch.tensor(scale, dtype=torch.float32, device=scene.device)[:, None]
         points = {"face": hammer.centroid("face"), "butt": (x, y, handle[0, 2]), "neck": (x, y, handle[1, 2])}
         self.points = {
@@ -234,6 +252,8 @@ class HammerTask(Task):
         radii = np.ptp(hammer.region("face").vertices, axis=0)[2] / 2 * scale
         self.nail.strike_with(actor, self.points["face"].cpu().numpy(), radii)
         self.history = Buffers(scene.num_envs, scene.device, history=(1 + round(c.window / c.dt), 7))
+        self.turning = Buffers(scene.num_envs, scene.device, held=(4,), way=())
+        self.turning.held[:, 0] = 1.0
         return actor
 
     def world(self, scene: TaskScene) -> Sequence[Actor | Link]:
@@ -252,22 +272,37 @@ class HammerTask(Task):
         middle[:, 2] += height - self.points["butt"][rows, 2]
         zero = torch.zeros_like(height)
         tilt = quaternion_from_rotation_vector(c.tilt * torch.stack([u[:, 3], u[:, 4], zero], -1))
-        roll = quaternion_from_rotation_vector(c.roll * torch.stack([zero, zero, u[:, 5]], -1))
+        angle = roll_at_release(u[:, 5], c.turn) if c.in_hand_turn else c.roll * u[:, 5]
+        roll = quaternion_from_rotation_vector(torch.stack([zero, zero, angle], -1))
         scene.object.set_pose(Pose.create_from_pq(middle, quaternion_multiply(tilt, roll)))
         scene.object.set_linear_velocity(torch.zeros_like(middle))
         scene.object.set_angular_velocity(c.spin * u[:, 6:9])
         self.nail.begin(rows)
         self.history.write(rows, history=UNKNOWN)
+        identity = torch.tensor([1.0, 0.0, 0.0, 0.0], device=scene.device)
+        self.turning.write(rows, held=identity, way=-angle.sign() if c.in_hand_turn else 0.0)
 
     def starts(self) -> ChosenStarts:
         """Place, height, tilt, roll and spin of the hammer when it is released: the random numbers themselves."""
         c: HammerConfig = self.config
         middles = zip("xy", c.release[:2], strict=True)
         place = [StartNumber(f"release {n}", "m", x - c.spread, x + c.spread) for n, x in middles]
-        turns = [StartNumber(n, "rad", -w, w) for n, w in (("tilt x", c.tilt), ("tilt y", c.tilt), ("roll", c.roll))]
+        roll = c.turn.arrives[1] if c.in_hand_turn else c.roll
+        turns = [StartNumber(n, "rad", -w, w) for n, w in (("tilt x", c.tilt), ("tilt y", c.tilt), ("roll", roll))]
         spins = [StartNumber(f"spin {n}", "rad/s", -c.spin, c.spin) for n in "xyz"]
         numbers = (*place, StartNumber("fall", "m", *c.fall), *turns, *spins)
-        return ChosenStarts(numbers, lambda shares: shares, lambda u, pose: u)
+        if not c.in_hand_turn:
+            return ChosenStarts(numbers, lambda shares: shares, lambda u, pose: u)
+
+        def draws(shares: Tensor) -> Tensor:
+            number = number_of_roll(float(2 * shares[ROLL] - 1) * roll, c.turn)
+            return torch.cat([shares[:ROLL], shares.new_tensor([(number + 1) / 2]), shares[ROLL + 1 :]])
+
+        def shares(u: Tensor, pose: Any) -> Tensor:
+            angle = roll_at_release(2 * u[ROLL : ROLL + 1] - 1, c.turn)
+            return torch.cat([u[:ROLL], (angle / roll + 1) / 2, u[ROLL + 1 :]])
+
+        return ChosenStarts(numbers, draws, shares)
 
     def drawn(self, scene: TaskScene) -> Mapping[str, tuple[Actor | Link, tuple[DrawnShape, ...]]]:
         """The table, the post and the nail."""
@@ -284,8 +319,13 @@ class HammerTask(Task):
         drift_p, drift_r = self._drift(s)
         return extended(
             s, HammerSnapshot, nail_p=nail_p, nail_depth=depth, nail_driven=self.nail.driven,
-            drift_p=drift_p, drift_r=drift_r, **self.points,
+            drift_p=drift_p, drift_r=drift_r, turned=self._turned(s), way=self.turning.way, **self.points,
         )  # fmt: skip
+
+    def _turned(self, s: Snapshot) -> Float[Tensor, " n"]:
+        """How far the fingers have turned the hammer the right way since it was held [rad]."""
+        now = relative((s.hand.wrist_p, s.hand.wrist_q), (s.object.p, s.object.q))[1]
+        return torch.where(s.stage >= HELD, self.turning.way * turn_about_handle(self.turning.held, now), 0.0)
 
     def _drift(self, s: Snapshot) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         """Motion of the hammer in the hand since the beginning of the window [m], [rad]; UNKNOWN before it is full."""
@@ -300,44 +340,22 @@ class HammerTask(Task):
     def remember(self, s: Snapshot) -> None:
         """Notes the pose of the hammer in the hand in the present control step, and whether it is held to strike."""
         assert isinstance(s, HammerSnapshot)
-        self.nail.let_strike((s.stage >= STRIKE) & in_hand(s, self.config))
+        self.nail.let_strike((s.stage >= strike_stage(self.config)) & in_hand(s, self.config))
         history = self.history.history
         rows, now = torch.arange(len(history), device=history.device), self._step(s) % history.shape[1]
-        history[rows, now] = torch.cat(relative((s.hand.wrist_p, s.hand.wrist_q), (s.object.p, s.object.q)), -1)
+        pose = relative((s.hand.wrist_p, s.hand.wrist_q), (s.object.p, s.object.q))
+        history[rows, now] = torch.cat(pose, -1)
+        self.turning.update(held=torch.where((s.stage < HELD)[:, None], pose[1], self.turning.held))
 
     def _step(self, s: Snapshot) -> Tensor:
         """Number of the control step in its episode (n,)."""
         return (s.time * self.MAX_STEPS).round().long()
 
     def stateful(self) -> dict[str, Any]:
-        return {"nail": self.nail, "history": self.history}
+        return {"nail": self.nail, "history": self.history, "turning": self.turning}
 
 
-def _nail_axis(s: HammerSnapshot) -> Tensor:
-    down = torch.tensor([0.0, 0.0, -1.0], device=s.hand.wrist_p.device)
-    return turned_in_wrist(s, down.expand_as(s.hand.wrist_p))
-
-
-def _axes(s: HammerSnapshot) -> Tensor:
-    return torch.cat([striking_axis(s), handle_axis(s)], -1)
-
-
-def _nail_depths(s: HammerSnapshot) -> Tensor:
-    return torch.stack([s.nail_depth, s.nail_driven], -1) * 100
-
-
-def _drifts(s: HammerSnapshot) -> Tensor:
-    return torch.stack([s.drift_p.clamp(max=0.1) * 10, s.drift_r.clamp(max=1)], -1)
-
-
-OBSERVATIONS: dict[str, Entry] = {
-    "length": Entry(lambda s: s.object.half[:, 2:], "m", "half length of the hammer"),
-    "nail": Entry(nail_in_hand, "m", "the nail's head in the hand frame"),
-    "nail_depth": Entry(_nail_depths, "cm", "depth of the nail, and how much of it blows have driven"),
-    "drift": Entry(_drifts, "dm, rad", "motion of the hammer in the hand within the window of the task (`window`)"),
-    "handle": Entry(tip_distance, "m", "distance of each fingertip's surface from the handle's", True, region=True),
-    "face": Entry(face_to_nail, "m", "striking face to the nail's head, world frame", True, region=True),
-    "axes": Entry(_axes, "1", "striking and handle axis, world frame", True, region=True),
-    "nail_axis": Entry(_nail_axis, "1", "nail axis in the hand frame", True, region=True, sensed=True),
-}
-"""What the task observes beyond the common entries; the guided ones are the affordance frame."""
+def handle_place() -> tuple[float, float]:
+    """x and y of the handle's axis in the hammer's frame [m]."""
+    x, y = load_object("hammer").region("handle").bounds.mean(0)[:2]
+    return float(x), float(y)
