@@ -1,29 +1,21 @@
-"""Re-orientation of the hammer in the hand: the turned release, grasps, finger motions, stage and reward."""
+"""Re-orientation of the hammer in the hand: the turned release, the turned grasps, stage and reward."""
 
-import shutil
-from math import pi
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import tomli_w
 import torch
 from test_stage_clauses import hammer_state, is_done
 
 import dora.tasks as tasks
 from dora.affordance.bundled_sets import bundled_path
 from dora.affordance.candidates import GraspCandidates
-from dora.affordance.objects.catalogue import load_object
 from dora.agents.config import RunConfig, _digested
 from dora.configs import plain
 from dora.errors import InputError
 from dora.geometry.poses import compose
 from dora.geometry.rotations import quaternion_apply, quaternion_from_rotation_vector, quaternion_multiply
-from dora.reading import read_toml
-from dora.robot import load_robot
 from dora.tasks.hammer import mdp
-from dora.tasks.hammer.finger_motion import TURNING_FILE, FingerMotion, load_motion
 from dora.tasks.hammer.reference import CatchSettings, phases
 from dora.tasks.hammer.task import HammerConfig, HammerTask, handle_place
 from dora.tasks.hammer.turning import (
@@ -34,7 +26,6 @@ from dora.tasks.hammer.turning import (
     turn_about_handle,
     turned_copies,
 )
-from dora.tools.in_task import turning as search
 
 CONFIG = HammerConfig(reorient="in_hand")
 TURN = CONFIG.turn
@@ -99,62 +90,18 @@ def test_a_turned_grasp_holds_the_turned_hammer_as_the_grasp_holds_the_other():
         torch.testing.assert_close(copy.grasp, grasps.grasp)
 
 
-# ---------------------------------------------------------------------- motions
-
-
-def test_a_motion_is_piecewise_linear_and_stays_where_it_ends():
-    way = torch.tensor([[1.0, 0.0], [3.0, -2.0]])
-    motion = FingerMotion(2.0, way, -way)
-    spent = torch.tensor([-0.1, 0.0, 0.5, 1.0, 1.5, 2.0, 9.0])
-    expected = torch.tensor([[0.0, 0.0], [0.0, 0.0], [0.5, 0.0], [1.0, 0.0], [2.0, -1.0], [3.0, -2.0], [3.0, -2.0]])
-    torch.testing.assert_close(motion.offsets(spent, torch.ones(7)), expected)
-    torch.testing.assert_close(motion.offsets(spent, -torch.ones(7)), -expected)
-
-
-def test_the_motion_that_is_shipped_moves_every_joint_within_reason():
-    robot = load_robot("diana7_hit")
-    motion = load_motion("hammer", robot)
-    assert motion.positive.shape == motion.negative.shape
-    assert motion.positive.shape[1] == len(robot.hand.names)
-    for way in (motion.positive, motion.negative):
-        assert 0.1 < way.abs().max() < pi
-    # the distal joints follow the medial ones
-    for coupling in robot.couplings:
-        a, b = coupling.follower, coupling.leader
-        torch.testing.assert_close(motion.positive[:, a], motion.positive[:, b])
-
-
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("turn", "told"),
     [
-        ({"format": "dora-turning 9"}, "the format is 'dora-turning 9'"),
-        ({"seconds": 0.0}, "seconds is 0.0"),
-        ({"seconds": "long"}, "seconds must be float"),
-        ({"positive": []}, "positive needs 1 to 100 rows"),
-        ({"negative": [[0.0, 0.1]]}, "negative needs 1 to 100 rows"),
-        ({"positive": [[float("nan")] * 20]}, "positive has an offset that is not a number"),
-        ({"joints": ["a"] * 20}, "has motions of the hand of diana7_hit, not of diana7_hit_left"),
-        ({"more": 1}, "has no field 'more'"),
+        ({"arrives": [0.0, 0.0]}, "turn.arrives is 0, 0"),
+        ({"arrives": [1.0, 0.5]}, "turn.arrives is 1, 0.5"),
+        ({"arrives": [0.5, 3.5]}, "turn.arrives is 0.5, 3.5"),
+        ({"least": 0.0}, "turn.least is 0"),
     ],
 )
-def test_a_file_of_motions_that_cannot_be_used_is_refused(tmp_path: Path, change: dict[str, Any], told: str):
-    source = load_object("hammer").folder
-    assert source is not None
-    folder = tmp_path / "hammer"
-    shutil.copytree(source, folder)
-    robot = load_robot("diana7_hit_left" if "joints" in change else "diana7_hit")
-    content = read_toml(source / TURNING_FILE, "file") | change
-    (folder / TURNING_FILE).write_text(tomli_w.dumps(content))
+def test_turns_that_make_no_sense_are_refused(turn: dict[str, Any], told: str):
     with pytest.raises(InputError, match=told):
-        load_motion(folder, robot)
-
-
-def test_without_a_file_of_motions_a_sentence_says_so(tmp_path: Path):
-    source = load_object("hammer").folder
-    assert source is not None
-    shutil.copytree(source, tmp_path / "hammer", ignore=shutil.ignore_patterns(TURNING_FILE))
-    with pytest.raises(InputError, match=TURNING_FILE):
-        load_motion(tmp_path / "hammer", load_robot("diana7_hit"))
+        tasks.make_task("DoraHammer-v1", 1, config={"reorient": "in_hand", "turn": turn})
 
 
 # ------------------------------------------------------------ stages and the reward
@@ -212,6 +159,9 @@ def test_turning_pays_until_it_is_enough():
 def test_an_episode_starts_turned_and_counts_from_where_the_hammer_was_held():
     task = tasks.make_task("DoraHammer-v1", 6, config={"reorient": "in_hand"})
     plain_task = tasks.make_task("DoraHammer-v1", 1)
+    copies = [len(one.guide.choice.candidates) for one in (task, plain_task)]
+    assert copies[0] == 2 * COPIES * copies[1]
+    assert "turning" not in plain_task.get_state_dict()
     sizes = [int(np.prod(one.single_observation_space.shape or ())) for one in (task, plain_task)]
     assert sizes[0] - sizes[1] == 2 + 1  # the turn and its way, and one more phase
     plain_task.close()
@@ -250,32 +200,6 @@ def test_settings_of_a_hammer_that_the_wrist_turns_have_the_digest_that_they_had
     less = TurnSettings(least=0.5)
     assert digest_with() == digest_with(turn=less)
     assert len({digest_with(), digest_with(reorient="in_hand"), digest_with(reorient="in_hand", turn=less)}) == 3
-
-
-def test_a_search_moves_to_what_turns_further():
-    """A population in which the turn is the first offset itself."""
-    torch.manual_seed(0)
-    state = search.Search(torch.zeros(2, 4, 15), torch.full((2, 4, 15), 0.5))
-    way = torch.tensor([-1.0, 1.0]).repeat(60)
-    random = torch.Generator().manual_seed(0)
-    for _ in range(8):
-        motions, number = state.draw(way, 2, random)
-        assert (torch.bincount(number[way > 0]) == 2).all()
-        turn = motions[:, 0, 0] * way
-        state.learn(motions, number, search.Turned(turn, turn, torch.ones(120, dtype=torch.bool), way))
-    assert state.mean[1, 0, 0] > 0.5
-    assert state.mean[0, 0, 0] < -0.5
-    assert (state.spread >= search.LEAST_SPREAD - 1e-6).all()
-
-
-def test_the_search_moves_thumb_and_fingers_along_five_synergies():
-    robot = load_robot("diana7_hit")
-    along = search.synergies(robot)
-    names = [[n for n, x in zip(robot.hand.names, row, strict=True) if x] for row in along]
-    fingers = ("Index", "Middle", "Ring", "Little")
-    assert names[:3] == [["Right_Thumb_0"], ["Right_Thumb_1"], ["Right_Thumb_2", "Right_Thumb_3"]]
-    assert names[3] == [f"Right_{finger}_1" for finger in fingers]
-    assert names[4] == [f"Right_{finger}_{k}" for finger in fingers for k in (2, 3)]
 
 
 @pytest.mark.slow

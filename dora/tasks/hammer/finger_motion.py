@@ -39,13 +39,18 @@ class FingerMotion:
 
     def offsets(self, spent: Float[Tensor, " n"], direction: Float[Tensor, " n"]) -> Float[Tensor, "n hand"]:
         """Offsets after some time [s], piecewise linear, for turns about +z (direction > 0) or -z [rad]."""
-        ways = torch.stack([self.negative, self.positive])
-        ways = torch.cat([torch.zeros_like(ways[:, :1]), ways], 1).to(spent.device)
-        last = ways.shape[1] - 1
-        moment = (spent / self.seconds).clamp(0, 1) * last
-        before = moment.long().clamp(max=last - 1)
-        way, share = (direction > 0).long(), (moment - before)[:, None]
-        return torch.lerp(ways[way, before], ways[way, before + 1], share)
+        ways = torch.stack([self.negative, self.positive]).to(spent.device)
+        return at_moment(ways[(direction > 0).long()], spent / self.seconds)
+
+
+def at_moment(moments: Float[Tensor, "n k hand"], share: Float[Tensor, " n"]) -> Float[Tensor, "n hand"]:
+    """Piecewise linear offsets, 0 at first and then through `moments` at equal distances, after a share of the time;
+    before and after it those of its ends."""
+    ways = torch.cat([torch.zeros_like(moments[:, :1]), moments], 1)
+    last = moments.shape[1]
+    moment = share.clamp(0, 1) * last
+    before, rows = moment.long().clamp(max=last - 1), torch.arange(len(ways), device=ways.device)
+    return torch.lerp(ways[rows, before], ways[rows, before + 1], (moment - before)[:, None])
 
 
 @dataclass(frozen=True)

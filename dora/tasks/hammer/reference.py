@@ -6,6 +6,7 @@ nothing depends on where the candidate wanted the hammer: its pose in the hand i
 pose is the pose that the *hammer* shall have, times the inverse of that.
 """
 
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -188,7 +189,8 @@ class CatchReference(Reference):
 
     def _in(self, *names: str) -> Bool[Tensor, " n"]:
         """Which environments are in one of these phases."""
-        return torch.isin(self.phase.index, torch.tensor([self._index[n] for n in names], device=self._reach.device))
+        first, *others = (self.phase.index == self._index[name] for name in names)
+        return functools.reduce(torch.logical_or, others, first)
 
     def _arrival(self, s: HammerSnapshot) -> Tensor:
         """Time (n,) until the candidate comes down to the height at which the fingers are to hold it [s]."""

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dora.affordance.candidates import GraspCandidates, concatenate
+from dora.errors import InputError
 from dora.geometry.poses import Pose, compose
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_inverse, quaternion_multiply
 
@@ -28,6 +29,15 @@ class TurnSettings:
     """Time for which it must be turned so far [s]."""
     weight: float = 1.0
     """Weight of the reward for the share of that turn [1]."""
+
+    def __post_init__(self) -> None:
+        low, high = self.arrives
+        if not (0 <= low <= high <= pi and high > 0):
+            raise InputError(
+                f"turn.arrives is {low:g}, {high:g}; it has to be two angles from 0 to pi, the larger last."
+            )
+        if not 0 < self.least <= pi:
+            raise InputError(f"turn.least is {self.least:g}; it has to be an angle above 0 and up to pi.")
 
 
 def turn_about_handle(before: Float[Tensor, "n 4"], now: Float[Tensor, "n 4"]) -> Float[Tensor, " n"]:

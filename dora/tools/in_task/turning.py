@@ -24,7 +24,7 @@ from torch import Tensor
 
 from dora.affordance.hand.postures import flexion
 from dora.affordance.objects.catalogue import load_object
-from dora.errors import command
+from dora.errors import InputError, command
 from dora.files import renew_checksums, write_bytes
 from dora.geometry.poses import relative
 from dora.geometry.rotations import quaternion_inverse, quaternion_multiply, rotation_vector_from_quaternion
@@ -32,7 +32,7 @@ from dora.progress import ProgressDisplay
 from dora.robot import RobotDescription, load_robot
 from dora.tasks import make_task
 from dora.tasks.env.env import DoraEnv
-from dora.tasks.hammer.finger_motion import FORMAT, TURNING_FILE, FingerMotion, load_motion
+from dora.tasks.hammer.finger_motion import FORMAT, TURNING_FILE, FingerMotion, at_moment, load_motion
 from dora.tasks.hammer.mdp import in_hand
 from dora.tasks.hammer.reference import TURNED_TIME, CatchReference
 from dora.tasks.hammer.snapshot import HammerSnapshot
@@ -44,13 +44,15 @@ MOMENTS, SECONDS = 4, 1.4
 """Moments at which offsets are given, and duration of the motion [s]."""
 ELITE, KEPT, LEAST_SPREAD = 0.25, 0.5, 0.06
 """Share of the population that is kept, share of the former mean in the next one, and smallest spread [rad]."""
+LEAST_POPULATION = 8
+"""Smallest population of which a few members can be kept."""
 OF_THE_MEAN = 2
 """Members of the population each way that are the mean itself, which shows how good it is."""
 FAR, TILT, SLIP, LOST, DEEP = 0.9, 0.5, 5.0, 1.0, 200.0
 """Turn beyond which more counts nothing [rad], and costs of a radian of other rotation, of a metre of displacement, of
 the loss of the hammer, and of a metre of overlap beyond the limit [rad]."""
-FARTHEST = 0.1
-"""Displacement beyond which more costs nothing more [m]."""
+FARTHEST, DEEPEST = 0.1, 0.01
+"""Displacement and overlap beyond which more costs nothing more [m]."""
 FALL, SAME_STARTS, CLEAN = 0.3, 6, 0.8
 """Longest fall of a hammer [s], generations that begin with the same caught hammers, and share of the limit of overlap
 that costs nothing [1]."""
@@ -74,20 +76,15 @@ class Args:
     """Of the search."""
 
 
+@dataclass(frozen=True)
 class Population(FingerMotion):
-    """A motion of its own for each environment."""
+    """A motion of its own for each environment, `motions` (n, k, hand), which goes the environment's way."""
 
-    def __init__(self, motions: Float[Tensor, "n k hand"]):
-        super().__init__(SECONDS, motions[0], motions[0])
-        object.__setattr__(self, "motions", motions)
+    motions: Float[Tensor, "n k hand"]
 
     def offsets(self, spent: Float[Tensor, " n"], direction: Float[Tensor, " n"]) -> Float[Tensor, "n hand"]:
-        """The offsets of each environment's motion; the direction is the environment's."""
-        ways: Tensor = torch.cat([torch.zeros_like(self.motions[:, :1]), self.motions], 1)  # pyright: ignore
-        moment = (spent / self.seconds).clamp(0, 1) * MOMENTS
-        before = moment.long().clamp(max=MOMENTS - 1)
-        rows = torch.arange(len(ways))
-        return torch.lerp(ways[rows, before], ways[rows, before + 1], (moment - before)[:, None])
+        """The offsets of each environment's motion."""
+        return at_moment(self.motions, spent / self.seconds)
 
 
 @dataclass(frozen=True)
@@ -154,7 +151,7 @@ def tried(task: DoraEnv, motions: Float[Tensor, "n k hand"], start: Caught) -> T
     """
     task.set_state_dict(start.state)
     reference = reference_of(task)
-    reference.motion = Population(motions)
+    reference.motion = Population(SECONDS, motions[0], motions[0], motions)
     s = task.snapshot
     first_p, first_q = relative((s.hand.wrist_p, s.hand.wrist_q), (s.object.p, s.object.q))
     _play(task, FALL + SECONDS + TURNED_TIME)
@@ -166,7 +163,7 @@ def tried(task: DoraEnv, motions: Float[Tensor, "n k hand"], start: Caught) -> T
     tilt = rotation_vector_from_quaternion(change)[:, :2].norm(dim=-1)
     config: Any = task.config
     held = in_hand(s, config)
-    deep = (s.max_penetration - CLEAN * config.penetration_limit).clamp(min=0, max=0.01)
+    deep = (s.max_penetration - CLEAN * config.penetration_limit).clamp(0, DEEPEST)
     slip = (p - first_p).norm(dim=-1).clamp(max=FARTHEST)
     score = turn.clamp(-FAR, FAR) - TILT * tilt - SLIP * slip - LOST * ~held - DEEP * deep
     return Turned(score, turn, held, start.way)
@@ -247,7 +244,11 @@ class Search:
 
 
 def search(args: Args) -> None:
-    """Runs the generations; raises InputError if the file of motions is damaged or cannot be written."""
+    """Runs the generations; raises InputError if the file of motions is damaged or cannot be written, or for a
+    population that is too small to choose from."""
+    for name, least in (("generations", 1), ("population", LEAST_POPULATION), ("tries", 1)):
+        if getattr(args, name) < least:
+            raise InputError(f"--{name} is {getattr(args, name)}; it has to be at least {least}.")
     robot, folder = load_robot(ROBOT), load_object(OBJECT).folder
     assert folder is not None
     path, along = folder / TURNING_FILE, synergies(robot)
