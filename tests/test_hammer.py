@@ -209,6 +209,18 @@ def test_the_residual_has_its_bounds_until_the_hammer_is_held_and_a_share_of_the
 
 
 @pytest.mark.parametrize(
+    ("phase", "share"), [("wait", 1.0), ("close", 1.0), ("settle", 0.3), ("align", 0.3), ("raise", 0.3), ("swing", 0.0)]
+)
+def test_the_pose_in_the_hand_is_followed_at_once_then_smoothly_and_not_in_a_blow(phase: str, share: float):
+    strike = Strike(torch.tensor(CONFIG.nail.top), torch.zeros(1, 3), CONFIG.swing_radius)
+    reference = CatchReference(1, strike, CONFIG.nail.driven, 0.025, "cpu", CatchSettings(memory=0.3))
+    reference.begin(torch.arange(1), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]))
+    reference.phase.index.fill_(PHASES.index(phase))
+    reference.advance(invented(1, object_p=torch.tensor([[0.1, 0.0, 0.0]])))
+    torch.testing.assert_close(reference.buffers.grasped_p, torch.tensor([[0.1 * share, 0.0, 0.0]]))
+
+
+@pytest.mark.parametrize(
     ("beyond", "driven", "done", "lost"),
     [(-0.01, False, False, False), (-0.01, True, False, False), (0.01, False, False, True), (0.01, True, True, False)],
 )

@@ -177,10 +177,17 @@ def test_an_episode_starts_turned_and_counts_from_where_the_hammer_was_held():
     later: Any = task.snapshot
     assert (later.stage >= mdp.HELD).any()
     assert (later.turned[later.stage < mdp.HELD] == 0).all()
-    stored = task.get_state_dict()
-    for _ in range(4):
+    stored, way = task.get_state_dict(), later.way.tolist()
+    while task.snapshot.time.max() < 0.42:
         task.step(zero)
+    still: Any = task.snapshot
+    rows = (later.stage >= mdp.HELD) & (still.stage >= mdp.HELD)
+    assert rows.any()
+    frozen = task.get_state_dict()["turning"]["held"]
+    assert torch.equal(frozen[rows], stored["turning"]["held"][rows])
+    assert (still.turned[rows].abs() > 0.05).any()
     task.task.place(task.task_scene, torch.arange(6), torch.rand(6, 9))
+    assert later.way.tolist() == way  # what a snapshot says does not change afterwards
     task.set_state_dict(stored)
     again: Any = task.get_state_dict()
     for name in ("held", "way"):
