@@ -138,6 +138,8 @@ def test_a_search_moves_to_what_turns_further():
     random = torch.Generator().manual_seed(0)
     for _ in range(8):
         motions, number = state.draw(way, 2, random)
+        own = number < search.OF_THE_MEAN
+        assert torch.equal(motions[own], state.mean[(way[own] > 0).long()])
         assert (torch.bincount(number[way > 0]) == 2).all()
         turn = motions[:, 0, 0] * way
         state.learn(motions, number, search.Turned(turn, turn, torch.ones(120, dtype=torch.bool), way))
