@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib import font_manager
 
-from dora.affordance.views.fonts import families
+from dora.affordance.views.fonts import LAST, families
 from dora.affordance.views.sheet import Panel, write_sheet
 
 
@@ -33,6 +33,16 @@ def test_installed_fonts_are_used_for_what_the_own_one_lacks():
         font_manager.findfont(font_manager.FontProperties(family=lacking[-1:]))
     ).get_charmap()
     assert {ord("把"), ord("手")} <= set(letters)
+
+
+def test_a_cached_list_without_the_last_resort_is_completed(monkeypatch: pytest.MonkeyPatch):
+    whole = font_manager.fontManager.ttflist
+    kept = [entry for entry in whole if entry.fname == font_manager.findfont(font_manager.FontProperties())]
+    monkeypatch.setattr(font_manager.fontManager, "ttflist", kept)
+    assert families("把")[-1].startswith(LAST)
+    assert sum(entry.name.startswith(LAST) for entry in font_manager.fontManager.ttflist) == 1
+    assert families("把")[-1].startswith(LAST)
+    assert sum(entry.name.startswith(LAST) for entry in font_manager.fontManager.ttflist) == 1
 
 
 def test_a_name_that_is_not_in_utf_8_is_drawn_as_far_as_it_goes(tmp_path: Path):

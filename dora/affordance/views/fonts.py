@@ -2,12 +2,15 @@
 
 import functools
 import unicodedata
+from pathlib import Path
 
-from matplotlib import font_manager, rcParams
+from matplotlib import font_manager, get_data_path, rcParams
 from matplotlib.font_manager import FontEntry, FontProperties
 
 LAST = "Last Resort"
 """Beginning of the name of a font that has a sign for the script of every character, which matplotlib brings."""
+LAST_FILE = "fonts/ttf/LastResortHE-Regular.ttf"
+"""Its file among matplotlib's data."""
 
 INVISIBLE = ("Cc", "Cf", "Cs", "Zs", "Zl", "Zp")
 """Categories of characters that no font has to draw."""
@@ -22,8 +25,7 @@ def families(text: str) -> list[str]:
     own = font_manager.findfont(FontProperties())
     missing = {ord(letter) for letter in text if unicodedata.category(letter) not in INVISIBLE} - _letters(own)
     chosen = list(rcParams["font.family"])
-    entries = sorted(font_manager.fontManager.ttflist, key=_rank)
-    for entry in entries:
+    for entry in sorted(_entries(), key=_rank):
         if not missing:
             break
         found = missing & _letters(entry.fname)
@@ -31,6 +33,15 @@ def families(text: str) -> list[str]:
             chosen.append(entry.name)
             missing -= found
     return chosen
+
+
+def _entries() -> list[FontEntry]:
+    """The fonts that matplotlib knows. Its list is cached for all environments of a user, and one that was made while
+    an environment was removed lacks matplotlib's own fonts; the last resort is added then."""
+    fonts, last = font_manager.fontManager, Path(get_data_path()) / LAST_FILE
+    if last.is_file() and not any(entry.name.startswith(LAST) for entry in fonts.ttflist):
+        fonts.addfont(last)
+    return fonts.ttflist
 
 
 def _rank(entry: FontEntry) -> tuple[bool, bool, str]:
