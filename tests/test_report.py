@@ -95,6 +95,30 @@ def test_runs_of_tasks_with_other_numbers_are_not_averaged(tmp_path: Path):
     ]  # fmt: skip
 
 
+def test_what_most_runs_have_goes_without_saying(tmp_path: Path):
+    """Only a value that is rarer than another is named; of two that are as frequent both are."""
+    usual = {"reorient": "wrist", "weights": {"penetration": -2.0}, "after_overlap": 0.3, "placed_after_overlap": 0.0}
+    without = {"weights": {"penetration": 0.0}, "after_overlap": 1.0, "placed_after_overlap": 1.0}
+    others = [usual | {"reorient": "in_hand"}, usual | without]
+    for seed, each in enumerate([usual, usual, others[0], others[1], others[1]]):
+        write_run(tmp_path / str(seed), seed, 0.2 * seed)
+        path = tmp_path / str(seed) / "result.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"task_config": each}))
+    terms = r"affordance, after\_overlap 0.3, placed\_after\_overlap 0.0, {}, weights.penetration -2.0"
+    rows = tables(find_runs(tmp_path)).splitlines()[2:]
+    assert [row.split(" | ")[3:5] for row in rows] == [
+        [terms.format("reorient wrist"), "2"], [terms.format("turned in the hand"), "1"],
+        ["affordance, reorient wrist, reward without overlap", "2"],
+    ]  # fmt: skip
+    write_run(tmp_path / "5", 5, 0.5)
+    path = tmp_path / "5" / "result.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"task_config": usual}))
+    rows = tables(find_runs(tmp_path)).splitlines()[2:]
+    assert [row.split(" | ")[3:5] for row in rows] == [
+        ["affordance", "3"], ["affordance, reward without overlap", "2"], ["affordance, turned in the hand", "1"],
+    ]  # fmt: skip
+
+
 def test_numbers_that_earlier_versions_lacked_make_no_rows_where_they_change_nothing(tmp_path: Path):
     for seed, each in enumerate([{"lift": 0.1}, {"lift": 0.1, "arm_effort": 1.0}, {"lift": 0.1, "arm_effort": 0.5}]):
         write_run(tmp_path / str(seed), seed, 0.5)

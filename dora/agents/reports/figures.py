@@ -92,7 +92,7 @@ def draw_curves(runs: Sequence[Run], env: str, preset: str) -> bytes:
 
 def draw_overlap(runs: Sequence[Run], env: str, preset: str) -> bytes:
     """A PNG of the share of evaluation episodes whose largest overlap stays below a depth, one line per learner and
-    guidance, over the episodes of all its seeds; dotted, zero correction."""
+    guidance, over the episodes of all its seeds; dotted, zero correction, once where it is that of the lines before."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -100,15 +100,16 @@ def draw_overlap(runs: Sequence[Run], env: str, preset: str) -> bytes:
 
     figure, axis = pyplot.subplots(figsize=(7, 4.2), layout="constrained")
     axis.set_prop_cycle(color=OTHERS)
-    max_penetration = 0.0
+    max_penetration, seen = 0.0, set[bytes]()
     for group, members in grouped(runs).items():
         if group[:2] != (env, preset):
             continue
         colour = COLOURS.get(group[2:4])
         for tables, style in (([m.episodes for m in members], "-"), (zero_episodes(members), ":")):
             depths = [table["penetration_mm"] for table in tables if "penetration_mm" in table]
-            if depths:
-                depth = np.sort(np.concatenate(depths))
+            depth = np.sort(np.concatenate(depths)) if depths else np.empty(0)
+            if len(depth) and (style == "-" or depth.tobytes() not in seen):
+                seen.add(depth.tobytes())
                 shares = np.arange(1, len(depth) + 1) / len(depth)
                 what = "" if style == "-" else ", zero correction"
                 label = f"{shortened(group[2])}, guidance {shortened(group[3])} ({len(depth)}){what}"

@@ -1,6 +1,6 @@
 """Finished runs as they lie in folders, and which of them make one row of a report."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,8 +26,16 @@ ALONE = 0.1
 SHARED, UNKNOWN = " \N{DAGGER}", " ?"
 """Marks of minutes beside other programs, and of minutes of which that was not measured."""
 
-IN_WORDS = {("optimised", "False"): "grasp made by hand", ("optimised", "True"): "grasps of the search"}
-"""Values of switches of tasks, by name and value, as readers of a table know them."""
+IN_WORDS = {
+    ("optimised", "False"): "grasp made by hand",
+    ("optimised", "True"): "grasps of the search",
+    ("reorient", "in_hand"): "turned in the hand",
+}
+"""Values of numbers of tasks, by name and value, as readers of a table know them."""
+WITHOUT_OVERLAP = {"after_overlap": "1.0", "placed_after_overlap": "1.0", "weights.penetration": "0.0"}
+"""Numbers of a task with which its reward does not depend on overlap: named together."""
+ALWAYS = ("optimised",)
+"""Numbers of tasks that are named whatever most runs of a row have, since neither of their values is the usual one."""
 
 EARLIER = ", earlier rules"
 """What is added to the guidance of runs whose task has other rules now."""
@@ -156,7 +164,8 @@ def grouped(runs: Sequence[Run]) -> dict[Group, list[Run]]:
 
 
 def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Runs by what the numbers of their task differ in, in words: by switches alone where these tell them apart."""
+    """Runs by what the numbers of their task differ in, in words: by switches alone where these tell them apart. What
+    more runs have than have anything else goes without saying."""
     known = all("learner_config" in run.result for run in runs)  # results of earlier versions lack it
     numbers = [
         dict(flat(NEUTRAL | (run.result.get("task_config") or {}))) | (_learner(run) if known else {}) for run in runs
@@ -168,11 +177,30 @@ def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
         [tuple(str(each.get(name)) for name in some) for each in numbers] for some in (switches, different)
     )
     enough = len(set(by_switch)) == len(set(by_all))
+    names, values = (switches, by_switch) if enough else (different, by_all)
+    usual = _most_frequent(values)
     found: dict[str, list[Run]] = defaultdict(list)
-    for run, values in zip(runs, by_switch if enough else by_all, strict=True):
-        words = zip(switches if enough else different, values, strict=True)
-        found["".join(f", {in_words(name, value)}" for name, value in words)].append(run)
+    for run, own in zip(runs, values, strict=True):
+        said = {
+            name: value
+            for k, (name, value) in enumerate(zip(names, own, strict=True))
+            if usual is None or value != usual[k] or name in ALWAYS
+        }
+        found["".join(f", {words}" for words in _phrases(said))].append(run)
     return found
+
+
+def _most_frequent(values: Sequence[tuple[str, ...]]) -> tuple[str, ...] | None:
+    """What stands more often among `values` than anything else; None if nothing does."""
+    first, *others = Counter(values).most_common(2)
+    return None if others and others[0][1] == first[1] else first[0]
+
+
+def _phrases(said: Mapping[str, str]) -> list[str]:
+    """Numbers of a task in words."""
+    together = said.items() >= WITHOUT_OVERLAP.items()
+    single = [in_words(name, value) for name, value in said.items() if not (together and name in WITHOUT_OVERLAP)]
+    return [*single, "reward without overlap"] if together else single
 
 
 def in_words(name: str, value: str) -> str:
