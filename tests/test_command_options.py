@@ -12,7 +12,7 @@ import pytest
 from commands import call, load_command
 
 from dora.agents.config import PPOConfig, RunConfig
-from dora.agents.limits import MOST_TRANSITIONS, check
+from dora.agents.limits import MOST_LAYERS, MOST_TRANSITIONS, WIDEST, check
 from dora.errors import InputError
 
 RUN = "--env DoraCube-v1 --agent ppo --workers 0"
@@ -73,6 +73,15 @@ def test_as_many_transitions_as_are_allowed_are():
     check(most)
     with pytest.raises(InputError, match="transitions at once"):
         check(dataclasses.replace(most, num_envs=1001))
+
+
+@pytest.mark.parametrize("hidden", [(1,), (WIDEST,), (1,) * MOST_LAYERS])
+def test_as_many_and_as_wide_layers_as_are_allowed_are(hidden: tuple[int, ...]):
+    run = RunConfig("x", "ppo", learner=PPOConfig(hidden=hidden))
+    check(run)
+    for wrong in ((*hidden[1:], 0), (*hidden[1:], WIDEST + 1), (1,) * (MOST_LAYERS + 1)):
+        with pytest.raises(InputError, match=r"--learner.hidden has to be"):
+            check(dataclasses.replace(run, learner=PPOConfig(hidden=wrong)))
 
 
 def test_transitions_of_an_iteration_are_bounded():

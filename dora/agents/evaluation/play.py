@@ -146,7 +146,7 @@ def episode_frames(task: Any, act: Act, seed: int) -> list[UInt8[np.ndarray, "h 
     for _ in range(task.max_steps):
         observation, _, _, _, info = task.step(act(observation).clamp(low, high))
         frames.append(_picture(task.render()))
-        if "fail" in info and bool(info["fail"].any()):
+        if "fail" in info and bool(info["fail"]):
             break
     return frames
 
