@@ -242,6 +242,7 @@ def test_a_file_that_cannot_be_made_or_closed_leaves_no_descriptor(tmp_path: Pat
     with pytest.raises(OSError, match="No such file"):
         ForgivingFile(tmp_path / "nowhere" / "file.h5")
     below, closed = ForgivingFile(tmp_path / "file.h5"), list[int]()
+    assert below.write(b"abc") == below.tell() == 3
 
     def close(descriptor: int) -> None:
         closed.append(descriptor)

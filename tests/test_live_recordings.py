@@ -82,7 +82,7 @@ def damaged(path: Path, folder: Path, how: str) -> Path:
         copy.with_suffix(".json").write_text(json.dumps(index) if how != "no json" else "{")
     if how == "text":
         copy.write_text("nothing")
-    elif how in ("no actions", "nan", "link", "words", "state"):
+    elif how in ("no actions", "nan", "link", "words", "no rows", "one number", "state"):
         with h5py.File(copy, "a") as file:
             group: Any = file["traj_0"]
             if how == "nan":
@@ -95,6 +95,8 @@ def damaged(path: Path, folder: Path, how: str) -> Path:
                 group["actions"] = h5py.ExternalLink(str(path), "traj_0/actions")
             elif how == "words":
                 group["actions"] = ["left", "right"]
+            elif how in ("no rows", "one number"):
+                group["actions"] = np.zeros((0, 26)) if how == "no rows" else 1.0
     return copy
 
 
@@ -112,6 +114,8 @@ def damaged(path: Path, folder: Path, how: str) -> Path:
         ("nan", "are no table of finite numbers"),
         ("link", "actions is missing or is a link"),
         ("words", "actions is no array of numbers"),
+        ("no rows", "actions has too many numbers, or no rows"),
+        ("one number", "actions has too many numbers, or no rows"),
     ],
 )
 def test_a_file_that_is_no_recording_is_refused(recording: Path, tmp_path: Path, how: str, words: str):

@@ -165,6 +165,16 @@ def test_tests_of_a_module_come_in_the_order_of_their_distance(project: Path):
     assert others == ["tests/test_stray.py"]
 
 
+def test_commands_that_tests_load_by_name_are_imported(tmp_path: Path):
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests/test_bad_input.py").write_text("from commands import load_command\n\nload_command('lift')\n")
+    (tmp_path / "tests/test_other.py").write_text("from commands import load_command\n\nload_command('sink')\n")
+    own, others = matching_tests(tmp_path, "dora/commands/lift.py")
+    assert own == ["tests/test_bad_input.py", "tests/test_other.py"]
+    assert others == []
+    assert matching_tests(tmp_path, "dora/commands/sink.py")[0] == own[::-1]
+
+
 def test_a_good_test_catches_and_a_useless_one_does_not(project: Path, tmp_path: Path):
     mutants, run, file = drawn(project, 2, 0, ROOM), _Runner(), tmp_path / "out" / "mutants.jsonl"
     judge = Judge(copied(project, tmp_path / "copy"), 60.0, 60.0, run)

@@ -5,6 +5,8 @@ from pathlib import Path
 
 ROOM, PARENT, FAR = 4, 5, 6
 """How far tests are from a module: of its room, of the package around that, and unrelated; 0 is nearest."""
+LOADER, COMMANDS = "load_command", "dora.commands"
+"""Function with which tests import a module of this package by its name."""
 
 
 def tests_of(root: Path, module: str) -> tuple[list[str], list[str]]:
@@ -59,11 +61,14 @@ def _imported_by_tests(root: Path) -> dict[str, set[str]]:
 
 
 def _imports(path: Path) -> set[str]:
-    """Dotted names that a file imports anywhere; names that are taken from a module count as its submodules, too."""
+    """Dotted names that a file imports anywhere; names that are taken from a module count as its submodules, too, and
+    so do commands that are loaded by name."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == LOADER:
+            found |= {f"{COMMANDS}.{name.value}" for name in node.args if isinstance(name, ast.Constant)}
     return found
