@@ -47,6 +47,34 @@ def test_a_cube_above_or_in_the_microwave_is_not_in_front_of_it(place: tuple[flo
     assert STAGES[RIGHT][2].done(invented(cube=cube).of(RIGHT)).tolist() == [expected] * 2
 
 
+@pytest.mark.parametrize(
+    ("place", "start", "expected"),
+    [
+        ((-0.29, 0.0, 0.1), -1.0, True), ((-0.31, 0.0, 0.1), -1.0, False),  # before it, too far before it
+        ((-0.1, 0.14, 0.1), -1.0, True), ((-0.1, 0.16, 0.1), -1.0, False), ((-0.1, -0.16, 0.1), -1.0, False),  # beside
+        ((-0.1, 0.0, 0.1), 0.11, True), ((-0.1, 0.0, 0.1), 0.13, False),  # raised by 9 or 7 cm
+    ],
+)  # fmt: skip
+def test_a_cube_is_carried_once_it_is_raised_and_before_the_cavity(
+    place: tuple[float, ...], start: float, expected: bool
+):
+    cube = {"p": in_world(*place), "start_p": torch.full((2, 3), start)}
+    assert STAGES[RIGHT][2].done(invented(cube=cube).of(RIGHT)).tolist() == [expected] * 2
+
+
+@pytest.mark.parametrize("at", [1, 2, 3])
+def test_a_cube_that_the_hand_has_lost_has_to_be_reached_again(at: int):
+    """Unless it lies inside, where it may be let go."""
+    stage, outside, within = STAGES[RIGHT][at], in_world(-0.1, 0.0, 0.1), in_world(0.12, 0.0, 0.05)
+    assert stage.back_to == "reach_cube"
+    assert stage.lost is not None
+    for cube, kept in ((outside, False), (within, stage.name == "put_in")):
+        near = cube[:, None].repeat(1, 5, 1)
+        for tips, away in ((near, False), (near + 0.2, True)):
+            s = invented(right={"tip_p": tips}, cube={"p": cube}).of(RIGHT)
+            assert stage.lost(s).tolist() == [away and not kept] * 2
+
+
 @pytest.mark.parametrize("missing", ["nothing", "inside", "still", "untouched", "out", "other hand out", "open"])
 def test_the_cube_is_put_down_when_it_lies_inside_alone(missing: str):
     touch = torch.zeros(2, 6, dtype=torch.bool)
