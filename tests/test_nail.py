@@ -18,9 +18,10 @@ from dora.geometry.rotations import (
     quaternion_from_rotation_vector,
     quaternion_multiply,
 )
+from dora.robot.shapes import Shape
 from dora.sim.substeps import watch_physics
 from dora.tasks.hammer.ballistics import Strike
-from dora.tasks.hammer.nail import driven_by_momentum, struck
+from dora.tasks.hammer.nail import drawn_links, driven_by_momentum, struck
 from dora.tasks.hammer.snapshot import HAND_CENTRE
 from dora.tasks.hammer.task import HammerConfig, HammerTask
 
@@ -251,3 +252,17 @@ def test_the_nail_never_comes_back_up_and_a_restored_one_stays_where_it_was(benc
     assert run(bench, 2)[1] == pytest.approx(driven, abs=1e-3)
     assert bench.task.nail.articulation.get_qpos().item() * 1000 == pytest.approx(depth, abs=0.05)
     assert depth < 1000 * CONFIG.nail.travel
+
+
+def test_the_drawn_nail_reaches_from_its_top_to_the_post_and_the_post_to_the_ground():
+    def ends(shape: Shape) -> tuple[float, float]:
+        """Its lowest and highest point along the nail, below the undriven nail's top [m]."""
+        along = shape.size[-1]
+        return shape.position[2] - along, shape.position[2] + along
+
+    (post,), nail = drawn_links(CONFIG.nail)
+    head, shank = (drawn.shape for drawn in nail)
+    assert ends(head) == pytest.approx((-0.004, 0.0))
+    assert ends(shank) == pytest.approx((-CONFIG.nail.stand, 0.0))
+    assert ends(post.shape) == pytest.approx((-CONFIG.nail.top[2], -CONFIG.nail.stand))
+    assert head.size[0] > shank.size[0]
