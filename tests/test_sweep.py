@@ -17,7 +17,7 @@ from rich.console import Console
 import dora.sweeps.sweep
 from dora.commands import sweep as command
 from dora.errors import InputError
-from dora.sweeps.board import Board, _news
+from dora.sweeps.board import Board, _news, summary
 from dora.sweeps.launching import LOG, is_locked, steps_of
 from dora.sweeps.plan import Row, rows_of
 from dora.sweeps.sweep import Entry, State, Sweep
@@ -64,6 +64,16 @@ def test_what_becomes_of_a_run_is_said_in_a_line(tmp_path: Path):
     entry.state = State.RUNNING
     (tmp_path / "run" / "progress.csv").write_text("env_steps,seconds\n7,1\n")
     assert _news(entry) == "goes on"
+
+
+def test_the_summary_counts_runs_of_other_processes_as_running(tmp_path: Path):
+    sweep = Sweep(few(6), tmp_path)
+    states = State.DONE, State.FAILED, State.RUNNING, State.ELSEWHERE, State.ELSEWHERE, State.WAITING
+    for entry, state in zip(sweep.entries, states, strict=True):
+        entry.state = state
+    assert summary(sweep).startswith("1 of 6 runs done, 3 running, 1 waiting, 1 failed; about ")
+    sweep.entries[1].state = State.WAITING
+    assert summary(sweep).startswith("1 of 6 runs done, 3 running, 2 waiting; about ")
 
 
 def test_why_a_run_could_not_be_begun_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
