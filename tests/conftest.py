@@ -18,8 +18,9 @@ LONG = (
 """Modules that take longest; they come first, so that no process is left with one of them when the others are done."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]):
-    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]):
+    if not any("::" in each or each.endswith(".py") for each in config.args):  # else in the order of the names
+        items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -11,6 +11,7 @@ import pytest
 
 from dora.errors import InputError
 from dora.tools.mutants import ROOMS, drawn, judge_all, judged
+from dora.tools.mutation.executions import executed, statement_lines
 from dora.tools.mutation.matching import tests_of as matching_tests
 from dora.tools.mutation.sites import mutants_of
 from dora.tools.mutation.trials import Judge, Outcome, Trial, copied
@@ -124,6 +125,9 @@ def test_more_mutants_than_there_are_are_refused(project: Path):
 def project(tmp_path: Path) -> Path:
     """A repository with a module of two faults: a test notices that of `less`, no test that of `more`."""
     files = {
+        "dora/__init__.py": "",
+        "dora/room/__init__.py": "",
+        "dora/room/other.py": "",
         "dora/room/sides.py": "def less(a, b):\n    return a < b\n\n\ndef more(a, b):\n    return a > b\n",
         "tests/test_sides.py": "from dora.room.sides import less\n\n\ndef test_less():\n    assert less(1, 2)\n",
         "tests/helper.py": "import dora.room.other\n",
@@ -181,7 +185,7 @@ def test_a_good_test_catches_and_a_useless_one_does_not(project: Path, tmp_path:
     trials = judge_all(mutants, judge, file)
     found = {mutant.before: trials[mutant.key] for mutant in mutants}
     assert found["return a < b"] == Trial("caught", "tests/test_sides.py::test_less")
-    assert found["return a > b"] == Trial("survived", stages=2)
+    assert found["return a > b"] == Trial("survived", stages=3)
     assert ["tests/test_stray.py"] in run.asked
     for root in (project, judge.copy):
         assert "a < b" in (root / "dora/room/sides.py").read_text()
@@ -201,10 +205,60 @@ def test_a_good_test_catches_and_a_useless_one_does_not(project: Path, tmp_path:
 def test_a_survivor_of_its_own_tests_meets_the_rest_of_the_suite_later(project: Path, tmp_path: Path):
     mutants, run, file = drawn(project, 2, 0, ROOM), _Runner(), tmp_path / "mutants.jsonl"
     judge = Judge(copied(project, tmp_path / "copy"), 60.0, None, run)
-    assert {trial.stages for trial in judge_all(mutants, judge, file).values()} == {0, 1}
+    assert {trial.stages for trial in judge_all(mutants, judge, file).values()} == {0, 2}
     judge.suite_limit, run.asked = 60.0, []
     judge_all(mutants, judge, file)
     assert run.asked == [["tests/test_stray.py"]]
+
+
+def test_tests_that_execute_the_line_come_first_and_once(project: Path, tmp_path: Path):
+    mutant = next(m for m in drawn(project, 2, 0, ROOM) if m.before == "return a > b")
+    run, stray, helped = _Runner(), "tests/test_stray.py::test_a", "tests/test_useless.py::test_nothing"
+    judge = Judge(copied(project, tmp_path / "copy"), 60.0, 60.0, run, executing=lambda mutant: [stray, helped])
+    assert judge.judge(mutant) == Trial("survived", stages=3)
+    assert run.asked[0] == [helped, stray]
+    assert run.asked[1][2:] == [f"--deselect={helped}"]
+    assert run.asked[2] == ["tests/test_stray.py", f"--deselect={stray}"]
+
+
+def test_a_run_under_coverage_tells_which_tests_execute_a_line(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    copy, out = copied(project, tmp_path / "copy"), tmp_path / "out"
+    mutants = {mutant.before: mutant for mutant in drawn(project, 2, 0, ROOM)}
+    found = executed(copy, out, processes=0)
+    assert found.tests(mutants["return a < b"]) == ["tests/test_sides.py::test_less"]
+    assert found.tests(mutants["return a > b"]) == []
+    assert not (copy / ".coveragerc").exists()
+    (kept,) = out.iterdir()
+    with monkeypatch.context() as without:
+        without.setattr("dora.tools.mutation.executions._run_under_coverage", None)  # what is kept needs no further run
+        assert executed(copy, out, processes=0).tests(mutants["return a > b"]) == []
+    kept.write_text("nothing")
+    with pytest.raises(InputError, match="delete it"):
+        executed(copy, out, processes=0).tests(mutants["return a < b"])
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        (1, (1, 1)),
+        (2, (2, 3)),
+        (3, (2, 3)),
+        (4, (4, 5)),
+        (5, (4, 5)),
+        (6, (6, 6)),
+        (7, (7, 7)),
+        (8, (8, 8)),
+        (9, (9, 9)),
+    ],
+)
+def test_a_statement_has_all_of_its_lines_and_no_others(line: int, expected: tuple[int, int]):
+    source = (
+        "def f(a):\n    b = (a +\n         1)\n    if (b >\n            2):\n        b = 3\n"
+        "    try:\n        b = 4\n    except ValueError:\n        pass\n"
+    )
+    assert statement_lines(source, line) == expected
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,9 @@
     python -m dora.tools.mutants --count 40 --seed 0 --out runs/mutants
 
 Draws mutants (a comparison turned, a sign, an `and` for an `or`, a number changed ...), equally many in each room, and
-runs in a temporary copy of the repository the tests of the mutant's module, then, if these pass, the rest of the
-suite. The working tree is not changed. Results are appended to OUT/mutants.jsonl; those that are there are not judged
+runs in a temporary copy of the repository the tests that execute its line, then, as long as all pass, those of its
+module, and the rest of the suite. Which tests execute a line is found by one run under coverage, kept in OUT. The
+working tree is not changed. Results are appended to OUT/mutants.jsonl; those that are there are not judged
 again. The exit status is 1 if fewer than 90 % are caught.
 """
 
@@ -25,6 +26,7 @@ from dora.errors import InputError, command
 from dora.parallel import name_leftovers, name_of_process
 from dora.progress import ProgressDisplay
 from dora.tables import text_table
+from dora.tools.mutation.executions import executed
 from dora.tools.mutation.sites import Mutant, mutants_of
 from dora.tools.mutation.trials import CAUGHT, Judge, Trial, copied, run_pytest
 
@@ -74,12 +76,15 @@ class Args:
     """Folder of the results."""
     list: bool = False
     """Only print which ones are drawn."""
+    coverage: bool = True
+    """Begin with the tests that execute the line, which takes one run of the whole suite under coverage."""
     whole_suite: bool = True
     """Run the rest of the suite for those that survive the tests of their module."""
     again: bool = False
     """Judge survivors anew, after tests have been added."""
     limit: float = 900.0
-    """Longest run of the tests of a module [s]; a mutant that needs more while the source does not is caught."""
+    """Longest run of the tests of a line, or of a module [s]; a mutant that needs more while the source does not is
+    caught."""
     suite_limit: float = 3600.0
     """Longest run of the rest of the suite [s]."""
     processes: int = 2
@@ -127,7 +132,7 @@ def _is_open(trial: Trial | None, judge: Judge, again: bool) -> bool:
     """Whether a mutant has to be judged, in view of an earlier trial."""
     if trial is None or trial.verdict == "unjudged":
         return True
-    return trial.verdict == "survived" and (again or (judge.suite_limit is not None and trial.stages < 2))
+    return trial.verdict == "survived" and (again or trial.stages < judge.stages)
 
 
 def judge_all(mutants: Sequence[Mutant], judge: Judge, path: Path, again: bool = False) -> dict[str, Trial]:
@@ -189,6 +194,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix=name_of_process()) as folder:
         run = functools.partial(run_pytest, processes=args.processes)
         judge = Judge(copied(root, Path(folder)), args.limit, args.suite_limit if args.whole_suite else None, run)
+        if args.coverage:
+            print("finding which tests execute which line ...", flush=True)
+            judge.executing = executed(judge.copy, args.out, args.processes).tests
         trials = judge_all(mutants, judge, args.out / FILE, args.again)
     caught = sum(trial.verdict in CAUGHT for trial in trials.values())
     print(f"{text_table(HEAD, rows(mutants, trials))}\n{caught} of {len(mutants)} caught")

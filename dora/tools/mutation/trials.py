@@ -103,40 +103,48 @@ class Trial:
 class Judge:
     """Tries mutants in a copy of the repository, one at a time; the copy is as it was after each.
 
-    A failure counts if the same test passes without the fault; a test that does not is left out from then on.
+    A mutant meets up to three stages of tests: those that execute its line, the rest of its module's, all others. A
+    failure counts if the same test passes without the fault; a test that does not is left out from then on.
 
     Attributes:
         copy: root of the copy.
-        limit: longest run of the tests of a module [s].
-        suite_limit: longest run of the rest of the suite [s]; None leaves it out.
+        limit: longest run of the first two stages, each [s].
+        suite_limit: longest run of the third one [s]; None leaves it out.
         run: runs tests.
+        executing: tests that execute the line of a mutant, as far as is known.
     """
 
     copy: Path
     limit: float
     suite_limit: float | None
     run: Runner = run_pytest
+    executing: Callable[[Mutant], Sequence[str]] = lambda mutant: ()
     left_out: list[str] = field(default_factory=list)
     _sound: dict[tuple[str, ...], bool] = field(default_factory=dict)
 
+    @property
+    def stages(self) -> int:
+        """How many stages of tests there are."""
+        return 2 if self.suite_limit is None else 3
+
     def judge(self, mutant: Mutant, survived: int = 0) -> Trial:
-        """What becomes of a mutant that has already survived so many stages: its module's tests, then all others."""
+        """What becomes of a mutant that has already survived so many stages."""
         own, others = tests_of(self.copy, mutant.module)
-        stages = [(own, self.limit)]
-        if self.suite_limit is not None:
-            stages.append((others, self.suite_limit))
-        for tests, limit in stages[survived:]:
-            trial = self._tried(mutant, tests, limit)
+        near = {module: place for place, module in enumerate([*own, *others])}
+        first = sorted(self.executing(mutant), key=lambda test: near.get(test.partition("::")[0], len(near)))
+        stages = [(first, [], self.limit), (own, first, self.limit), (others, first, self.suite_limit)]
+        for tests, done, limit in stages[survived : self.stages]:
+            trial = None if limit is None else self._tried(mutant, tests, done, limit)
             if trial is not None:
                 return trial
-        return Trial("survived", stages=max(len(stages), survived))
+        return Trial("survived", stages=max(self.stages, survived))
 
-    def _tried(self, mutant: Mutant, tests: Sequence[str], limit: float) -> Trial | None:
-        """The verdict of some tests; None if they notice nothing."""
+    def _tried(self, mutant: Mutant, tests: Sequence[str], done: Sequence[str], limit: float) -> Trial | None:
+        """The verdict of some tests, without those that are done; None if they notice nothing."""
         path = self.copy / mutant.module
         source = path.read_text()
         while wanted := [test for test in tests if test not in self.left_out]:
-            skipped = [f"--deselect={test}" for test in self.left_out if test.partition("::")[0] in wanted]
+            skipped = [f"--deselect={test}" for test in [*done, *self.left_out] if test.partition("::")[0] in wanted]
             path.write_text(mutant.applied(source))
             try:
                 outcome = self.run(self.copy, [*wanted, *skipped], limit)
