@@ -68,9 +68,6 @@ class PPOConfig:
     """Smallest logarithm of the exploration noise."""
     noise_correlation: float = 0.0
     """Correlation of the exploration noise of successive steps, in [0, 1)."""
-    average: float = 0.0
-    """Share that each iteration keeps of the average of the actors so far, which is evaluated and kept, in [0, 1); 0:
-    the latest actor is."""
     hidden: tuple[int, ...] = (256, 128)
     """Widths of the hidden layers of actor and critic."""
 
@@ -139,9 +136,7 @@ UNUSED = {"reward": "dense", "after_success": None}
 """The same of settings of the run."""
 CONSTANT_PULL = {"prior_last": None, "prior_steps": 100_000}
 """Settings of a pull that does not change."""
-NEUTRAL_PPO = {"prior": 0.0, "average": 0.0, **CONSTANT_PULL}
-"""Settings of PPO and its kin that change nothing."""
-NEUTRAL_LEARNER = {"ppo": NEUTRAL_PPO, "mappo": NEUTRAL_PPO, "happo": NEUTRAL_PPO, "sac": CONSTANT_PULL}
+NEUTRAL_LEARNER = {name: {"prior": 0.0, **CONSTANT_PULL} for name in ("ppo", "mappo", "happo")} | {"sac": CONSTANT_PULL}
 """The same of settings of each learner."""
 DIGITS = 12
 """Hexadecimal digits of a digest of settings."""

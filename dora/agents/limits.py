@@ -49,7 +49,6 @@ LEARNER = {
     "gae_lambda": SHARE,
     "polyak": SHARE,
     "noise_correlation": (0, 1 - 1e-9),
-    "average": (0, 1 - 1e-9),
     "learning_rate": RATE,
     "learning_rate_min": RATE,
     "learning_rate_max": RATE,

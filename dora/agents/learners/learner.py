@@ -21,14 +21,9 @@ class Learner(Protocol):
     """What the training loop needs of an algorithm."""
 
     policy: Policy
-    """Acts while transitions are collected."""
+    """Acts while transitions are collected, and greedily in evaluations."""
     rollout: int
     """Control steps per environment and batch."""
-
-    @property
-    def evaluated(self) -> Policy:
-        """Acts greedily in evaluations, and is kept if it is the best so far: mostly `policy` itself."""
-        ...
 
     @property
     def replay(self) -> Replay | None:

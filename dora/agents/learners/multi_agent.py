@@ -22,7 +22,6 @@ from torchrl.objectives import ClipPPOLoss
 
 from dora.agents.agent_columns import Agents
 from dora.agents.config import HAPPOConfig, MAPPOConfig, PPOConfig
-from dora.agents.learners.averaging import AveragedPolicy
 from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, GaussianActor, JointActor, LatestOutput, Normaliser, Policy, for_loss
 from dora.agents.learners.ppo import ADAM_EPSILON, adapted, excess, squared, standardised, transitions
@@ -58,7 +57,6 @@ class MultiAgentPPO:
         self.actor = JointActor(agents, config.hidden, config.log_std)
         self.critic = Critic(observation, config.hidden, nn.ELU, layer_norm=False)
         self.policy = Policy(self.normaliser, self.actor, config.noise_correlation)
-        self._average = AveragedPolicy(self.policy, config.average)
         self.steps = 0.0
         self.updates = {n: AgentUpdate(n, for_loss(self.actor.of(n), IndependentNormal), config) for n in agents}
         self.critic_adam = torch.optim.Adam(
@@ -66,14 +64,9 @@ class MultiAgentPPO:
         )
 
     @property
-    def evaluated(self) -> Policy:
-        """The average of successive policies, or the latest one."""
-        return self._average.policy
-
-    @property
     def modules(self) -> dict[str, nn.Module]:
         """What a checkpoint holds, by name."""
-        return {"normaliser": self.normaliser, "actor": self.actor, "critic": self.critic, **self._average.modules}
+        return {"normaliser": self.normaliser, "actor": self.actor, "critic": self.critic}
 
     @property
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
@@ -111,7 +104,6 @@ class MultiAgentPPO:
         self.normaliser.update(batch["observation"])
         if stop():
             return {}
-        self._average.follow()
         values = {f"{n}/{agent}": v for agent, own in zip(self.agents, found, strict=True) for n, v in own.items()}
         return values | {"value": value, "explained_variance": float(data["explained"][0])}
 

@@ -10,7 +10,6 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from dora.agents.config import PPOConfig
-from dora.agents.learners.averaging import AveragedPolicy
 from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, GaussianActor, LatestOutput, Normaliser, Policy, for_loss
 from dora.agents.learners.pull import pull
@@ -45,7 +44,6 @@ class PPO:
         self.actor = GaussianActor(observation, action, config.hidden, config.log_std)
         self.critic = Critic(observation, config.hidden, nn.ELU, layer_norm=False)
         self.policy = Policy(self.normaliser, self.actor, config.noise_correlation)
-        self._average = AveragedPolicy(self.policy, config.average)
         self.learning_rate, self.steps = config.learning_rate, 0.0
         self.loss = ClipPPOLoss(
             for_loss(self.actor, IndependentNormal),
@@ -63,14 +61,9 @@ class PPO:
         self.optimiser = torch.optim.Adam(parameters, lr=self.learning_rate, eps=ADAM_EPSILON, fused=True)
 
     @property
-    def evaluated(self) -> Policy:
-        """The average of successive policies, or the latest one."""
-        return self._average.policy
-
-    @property
     def modules(self) -> dict[str, nn.Module]:
         """What a checkpoint holds, by name."""
-        return {"normaliser": self.normaliser, "actor": self.actor, "critic": self.critic, **self._average.modules}
+        return {"normaliser": self.normaliser, "actor": self.actor, "critic": self.critic}
 
     @property
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
@@ -116,7 +109,6 @@ class PPO:
         divergence = float(torch.stack(divergences).mean())
         self.set_learning_rate(adapted(self.learning_rate, divergence, self.config))
         means = torch.stack(losses).mean(0).tolist()
-        self._average.follow()
         self.normaliser.update(batch["observation"])
         names = ("policy", "value", "entropy", "bound", "clip_fraction", "grad_norm", "correction")
         return dict(zip(names, means[:-1], strict=True)) | {

@@ -65,11 +65,6 @@ class SAC:
         self.updates, self.due = 0, 0.0
 
     @property
-    def evaluated(self) -> Policy:
-        """The policy itself."""
-        return self.policy
-
-    @property
     def modules(self) -> dict[str, nn.Module]:
         """What a checkpoint holds, by name."""
         return {"normaliser": self.normaliser, "actor": self.actor, "loss": self.loss}

@@ -272,7 +272,7 @@ class Trainer:
         if not self.folder.latest.exists():  # where a policy has been evaluated, there is a checkpoint to go on from
             self.save()
         start = time.perf_counter()
-        evaluation = self._evaluators.run(self.learner.evaluated, config.eval_episodes, PERIODIC_SEED, interrupt.check)
+        evaluation = self._evaluators.run(self.learner.policy, config.eval_episodes, PERIODIC_SEED, interrupt.check)
         self.counters.seconds["evaluate"] += time.perf_counter() - start
         self._take_time()
         while counters.next_evaluation <= counters.env_steps:
@@ -301,7 +301,7 @@ class Trainer:
 
     def _keep_as_best(self) -> None:
         """Write the networks that act, without critics."""
-        self._checkpoint(pack_modules(self.learner.evaluated.modules_by_name)).write(self.folder.best)
+        self._checkpoint(pack_modules(self.learner.policy.modules_by_name)).write(self.folder.best)
 
     def _final_evaluation(self, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
         """Evaluate the best policy, and zero correction, on seeds that did not select it."""
