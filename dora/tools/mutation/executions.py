@@ -15,17 +15,17 @@ from dora.tools.mutation.sites import Mutant
 
 SETTINGS = "[run]\nrelative_files = true\nsource = dora\n"
 """Settings of coverage: files are named below the root, as those of mutants."""
-CALL = "|run"
-"""Ending of the contexts of coverage that are calls of tests; those of fixtures have others."""
+PHASE = "|"
+"""What stands between a test and its phase (setup, run, teardown) in the contexts of coverage."""
 SUFFIX = ".coverage"
 """Ending of the files of a run under coverage."""
 
 
 class Executions:
-    """Calls of tests that execute a line, by a file of coverage.
+    """Tests that execute a line, by a file of coverage.
 
-    What fixtures execute is nobody's: a fixture of a module or of the session would count for its first test alone.
-    Neither is what runs in other processes, or compiled.
+    What a fixture of a whole module or session executes counts for its first test alone, and what runs in other
+    processes, compiled or while modules are imported, for none.
 
     Args:
         root: of the repository that has been run.
@@ -43,11 +43,11 @@ class Executions:
             raise InputError(f"{path} cannot be read: delete it, and it is made anew.") from error
 
     def tests(self, mutant: Mutant) -> list[str]:
-        """Tests whose call executes the statement of a mutant, as pytest names them, sorted."""
+        """Tests that execute the statement of a mutant, as pytest names them, sorted."""
         by_line = self._contexts(mutant.module)
         first, last = statement_lines((self._root / mutant.module).read_text(), mutant.line)
         contexts = {context for line in range(first, last + 1) for context in by_line.get(line, ())}
-        return sorted(context.removesuffix(CALL) for context in contexts if context.endswith(CALL))
+        return sorted({context.rpartition(PHASE)[0] for context in contexts} - {""})
 
     @functools.cache  # noqa: B019 - lives as long as the program
     def _contexts(self, module: str) -> dict[int, list[str]]:
