@@ -111,7 +111,7 @@ def above_the_best(cells: Mapping[Cell, list[Run]]) -> Section:
         bar, lowest = PAPER[best].success, min(both, key=rates.rate)
         worst = rates.rate(lowest)
         first = env, f"{bar:.1f} ({best[1]})"
-        rows.append(rates.row(first, both, f"{worst:.1f}", worst - bar, rates.errors.get(lowest, 0.0), ("yes", "no")))
+        rows.append(rates.row(first, both, f"{worst:.1f}", worst - bar, rates.error([lowest]), ("yes", "no")))
     note = (
         "No claim of the paper. Its simulator, success and randomisation are others (see below), so this does not say "
         "which method is better."

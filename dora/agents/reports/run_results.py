@@ -127,7 +127,7 @@ def _with_zero(runs: Sequence[Run]) -> list[Run]:
 
     def starts(run: Run) -> tuple[Any, ...]:
         r = run.result
-        first = r.get("first_seed", FINAL_SEED), r.get("eval_episodes", 0)
+        first = r.get("first_seed", FINAL_SEED), r.get("eval_episodes")
         return r["env"], run.group[1], run.group[3], str(sorted(flat(NEUTRAL | (r.get("task_config") or {})))), *first
 
     measured = {starts(run): run for run in runs if run.result["zero_success_rate"] is not None}
@@ -230,9 +230,9 @@ def zero_shares(runs: Sequence[Run]) -> list[tuple[float, int]]:
     found: dict[int, tuple[float, int]] = {}
     for run in runs:
         r = run.result
-        first, share = r.get("first_seed", FINAL_SEED), (r["zero_success_rate"], r.get("eval_episodes", 0))
-        if share[0] is not None and share[1] >= found.get(first, (0.0, -1))[1]:
-            found[first] = share
+        first, rate, count = r.get("first_seed", FINAL_SEED), r["zero_success_rate"], r.get("eval_episodes", 0)
+        if rate is not None and (first not in found or count >= found[first][1]):
+            found[first] = rate, count
     return list(found.values())
 
 

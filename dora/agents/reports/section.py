@@ -50,7 +50,7 @@ def outcomes_of(
     columns = [table.get("success") for table in tables]
     known = [column for column in columns if column is not None]
     alike = len(known) == len(columns) and len({len(c) for c in known}) == 1 and len(set(first)) == 1
-    return np.stack(known) if known and alike else None
+    return np.stack(known) if alike else None
 
 
 def rate_of(runs: Sequence[Run]) -> float:

@@ -32,7 +32,7 @@ def crossed_interval(outcomes: Float[np.ndarray, "seeds starts"]) -> Interval:
     generator = np.random.default_rng(SEED)
     seeds, starts = outcomes.shape
     if np.ptp(outcomes) == 0:
-        return wilson(round(starts * float(outcomes.flat[0])), starts)
+        return wilson(round(starts * float(outcomes.mean())), starts)
     means = [
         outcomes[np.ix_(generator.integers(seeds, size=seeds), generator.integers(starts, size=starts))].mean()
         for _ in range(SAMPLES)
