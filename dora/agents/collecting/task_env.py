@@ -177,6 +177,7 @@ class TaskEnv(EnvBase):
         self._high = torch.as_tensor(task.single_action_space.high, device=task.device)
         self._set_seed(seed)
         self._set_specs(task.reset(seed=self._pending_seed)[0])
+        self.is_closed = False  # TorchRL says so of the environments alone that it makes itself
 
     def _set_specs(self, observation: Tensor) -> None:
         n, device = self.batch_size[0], self.device
