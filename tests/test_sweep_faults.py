@@ -5,8 +5,6 @@ import json
 import os
 import sys
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from commands import call
@@ -207,49 +205,3 @@ def test_a_sweep_tells_how_to_get_the_zero_correction_that_a_failed_run_owes(
     told = capsys.readouterr().err
     expected = f"dora run --eval-only --checkpoint '{out / row.name}' --out '{out / 'zero' / row.name}' --episodes 500"
     assert (f"{expected} --zero-correction" in told) is not bool(evaluated)
-
-
-class FakeRay(SimpleNamespace):
-    """Ray as its launcher uses it, with machines of `cpus` cores, the last one gone."""
-
-    def __init__(self, cpus: list[int], error: Exception | None = None):
-        super().__init__(cpus=cpus, error=error, begun=[], ended=0, options={})
-
-    def init(self, **options: Any) -> None:
-        if self.error is not None:
-            raise self.error
-        self.begun.append(options)
-
-    def shutdown(self) -> None:
-        self.ended += 1
-
-    def nodes(self) -> list[dict[str, Any]]:
-        alive = [True] * (len(self.cpus) - 1) + [False]
-        return [{"Resources": {"CPU": n}, "Alive": yes} for n, yes in zip(self.cpus, alive, strict=True)]
-
-    def remote(self, **options: Any) -> Any:
-        self.options = options
-        return lambda function: function
-
-
-def test_a_cluster_has_room_for_whole_runs_on_each_living_machine(monkeypatch: pytest.MonkeyPatch):
-    """Three cores of one and three of another machine are room for two runs of two cores, not for three."""
-    ray = FakeRay([3, 3, 64])
-    monkeypatch.setitem(sys.modules, "ray", ray)
-    launcher = ray_cluster.RayLauncher("10.0.0.1:6379", cores=2)
-    assert launcher.room == 2
-    assert ray.begun == [
-        {"address": "10.0.0.1:6379", "include_dashboard": False, "log_to_driver": False, "logging_level": "ERROR"}
-    ]
-    assert ray.options == {"num_cpus": 2, "max_retries": ray_cluster.RETRIES}
-    assert not ray.ended
-    with pytest.raises(InputError, match="A run takes 4 cores, and no machine"):
-        ray_cluster.RayLauncher(cores=4)
-    assert ray.ended == 1
-
-
-@pytest.mark.parametrize(("address", "where"), [("10.0.0.1:6379", "10.0.0.1:6379"), (None, "this machine")])
-def test_a_cluster_that_does_not_answer_is_named(address: str | None, where: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "ray", FakeRay([2], ConnectionError("no route\nto host")))
-    with pytest.raises(InputError, match=rf"at {where} \(ConnectionError: no route\): start one"):
-        ray_cluster.RayLauncher(address)

@@ -1,6 +1,8 @@
 """Sweeps: which runs, and which are finished already."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_run import fake_words
@@ -48,6 +50,33 @@ def test_only_some_rows_may_be_asked_for():
         rows_of("paper", agents=["ddpg"])
     with pytest.raises(InputError, match="fits all of"):
         rows_of("paper", envs=["DoraCube-v1"], agents=["happo"])
+
+
+def test_kinds_of_guidance_are_asked_for_by_the_names_of_the_table():
+    rows = rows_of("paper", envs=["DoraCube-v1"], guidance=["affordance observation reward filter", "grasps"])
+    assert [row.name.name for row in rows[:2]] == ["sac-grasps-s10", "sac-affordance-observation-reward-filter-s10"]
+    assert [row.config.seed for row in rows] == [10, 10, 11, 11, 12, 12]
+    (quick,) = rows_of("quick", envs=["DoraCube-v1"], guidance=["none"])
+    assert (quick.config.seed, quick.config.total_steps, quick.config.final_episodes) == (10, 20_000, 50)
+    (shorter,) = rows_of("quick", envs=["DoraCube-v1"], guidance=["none"], episodes=7)
+    assert shorter.config.final_episodes == 7
+    with pytest.raises(InputError, match="There is no sweep 'papers': use one of paper, quick"):
+        rows_of("papers")
+
+
+def test_zero_correction_is_the_same_for_any_learner_and_seed_in_the_same_task():
+    (row,) = few(1)
+
+    def same(**change: Any) -> bool:
+        return row.same_zero(Row("another part", replace(row.config, **change)))
+
+    assert same()
+    assert same(agent="sac", seed=7, total_steps=9)
+    others: list[dict[str, Any]] = [
+        {"env": "DoraJug-v1"}, {"preset": "hard"}, {"guidance": "grasps"}, {"guidance_parts": MECHANISM},
+        {"final_episodes": 7}, {"task": row.config.task | {"lift": 0.3}},
+    ]  # fmt: skip
+    assert [change for change in others if same(**change)] == []
 
 
 # -------------------------------------------------------- what is finished already
