@@ -130,9 +130,9 @@ def test_the_table_of_a_terminal_has_the_nearest_runs_before_and_after_those_tha
 ):
     shown = 2
     monkeypatch.setattr(boards, "SHOWN", shown)
-    rows = few(2 * shown + 6)
+    rows = few(2 * shown + 7)
     sweep = Sweep(rows, tmp_path)
-    states = [State.DONE] * (shown + 2) + [State.FAILED, State.RUNNING] + [State.WAITING] * (shown + 2)
+    states = [State.DONE] * (shown + 3) + [State.FAILED, State.RUNNING] + [State.WAITING] * (shown + 2)
     for entry, state in zip(sweep.entries, states, strict=True):
         entry.state = state
-    assert list(boards._table(sweep).columns[1].cells) == [str(row.name) for row in rows[2:-2]]
+    assert list(boards._table(sweep).columns[1].cells) == [str(row.name) for row in rows[3:-2]]

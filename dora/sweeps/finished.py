@@ -80,7 +80,7 @@ def result_of(row: Row, found: Sequence[Finished]) -> Finished | None:
 def seconds_per_step(row: Row, found: Sequence[Finished]) -> float:
     """Time that an environment step of a run takes, evaluations included, from runs of the task and learner, else of
     the task, else as once measured [s]."""
-    known = [one for one in found if one.env == row.config.env and one.env_steps > 0]
+    known = [one for one in found if one.env == row.config.env]
     same = [one for one in known if one.agent == row.config.agent] or known
     if same:
         return mean(one.seconds / one.env_steps for one in same)
