@@ -187,14 +187,14 @@ class AffordanceMap:
         _check_stored(Path(path), tensors, metadata)
         vertices, faces, face_labels = (tensors[key].numpy() for key in ("vertices", "faces", "face_labels"))
         return cls(
-            points=tensors["points"],
-            normals=tensors["normals"],
-            areas=tensors["areas"],
-            labels=tensors["labels"],
+            points=tensors["points"].float(),
+            normals=tensors["normals"].float(),
+            areas=tensors["areas"].float(),
+            labels=tensors["labels"].long(),
             name=metadata["name"],
             names=tuple(metadata["names"]),
             mesh=trimesh.Trimesh(vertices, faces, process=False),
-            face_labels=face_labels,
+            face_labels=face_labels.astype(np.int64),
             digest=metadata["digest"],
         )
 
