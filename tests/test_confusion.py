@@ -42,3 +42,4 @@ def test_clearly_held():
     force = torch.tensor([[2.0, 1.0, 0.0], [2.0, 1.1, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 5.0]])
     assert pytest.approx(2 / 3) == DOMINANT_SHARE
     assert clearly_dominant(force).tolist() == [True, False, False, True]
+    assert clearly_dominant(0.01 * force).tolist() == [True, False, False, True]  # a light hold is one, too

@@ -40,6 +40,16 @@ def test_maps_are_packed_without_loss(points: int):
     assert tensors == {}
 
 
+def test_maps_of_one_point_can_be_read_again():
+    maps = torch.tensor([[2], [0], [6]], dtype=torch.uint8)
+    assert torch.equal(unpack(pack(maps), 3, 1, "a"), maps)
+
+
+@pytest.mark.parametrize(("points", "kind"), [(2**15, torch.int16), (2**15 + 1, torch.int32)])
+def test_a_point_takes_two_bytes_where_that_is_enough(points: int, kind: torch.dtype):
+    assert pack(torch.ones(1, points, dtype=torch.uint8))[POINT].dtype == kind
+
+
 def test_maps_that_could_not_be_read_again_are_not_written(jug: GraspCandidates, tmp_path: Path):
     maps = torch.zeros((), dtype=torch.uint8).expand(2**16 + 1, 2**12)
     with pytest.raises(InputError, match=r"65537 contact maps of 4096 points .*keep at most 65536 candidates"):
@@ -82,6 +92,7 @@ def integers(*values: int) -> torch.Tensor:
     [
         ({COUNT: integers(1, 1)}, "do not fit 3 candidates"),
         ({COUNT: integers(1, 2, 1)}, "do not fit 3 candidates"),
+        ({COUNT: integers(2, 0, 0, 1)}, "do not fit 3 candidates"),
         ({COUNT: integers(4, -1, 0)}, "do not fit 3 candidates"),
         ({PART: integers(1, 2)}, "do not fit 3 candidates"),
         ({POINT: integers(3, 9, 10)}, "not 0 to 9"),

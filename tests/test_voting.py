@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dora.affordance.hand.hand_model import HandModel
+from dora.affordance.maps import contact_semantic_map as maps
 from dora.affordance.maps.affordance_map import AffordanceMap
 from dora.affordance.maps.contact_semantic_map import (
     contact_semantic_map,
@@ -21,6 +22,7 @@ from dora.affordance.maps.voting import HAND_PARTS, NO_CONTACT, VotingSettings, 
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.objects.signed_distance import SignedDistanceField
 from dora.errors import InputError
+from dora.geometry.segments import distance_to_segment
 from dora.robot import load_robot
 
 ENVIRONMENTS, CONTACTS = 128, 6
@@ -170,7 +172,31 @@ def _seconds(*arguments) -> float:
     return time.process_time() - start
 
 
-@pytest.mark.parametrize("wrong", [{"neighbours": 0}, {"weights": (1.0, 1.0)}, {"weights": (0.0,) * 6}])
+@pytest.mark.parametrize(
+    ("weights", "where", "finger", "expected"),
+    [
+        ((1e-3, 2e-3, 1e-3, 1e-3, 1e-3, 1e-3), [0.0, 0.0, 0.0, 0.05], [3, 3, 3, 2], 2),  # many neighbours are a
+        ((1.0, 1.5, 1.0, 1.0, 1.0, 2000.0), [0.0, 0.0, 0.0, 0.05], [3, 3, 3, 2], 2),
+        ((0.2, 0.2, 0.1, 0.1, 0.1, 0.1), [0.0, 0.05, 0.028], [1, 2, 3], 0),  # .2 : .2 for a and c, first name
+        ((0.2, 0.2, 0.1, 0.1, 0.1, 0.1), [0.0, 0.05, 0.05], [1, 2, 2], 2),  # and more neighbours are c
+    ],
+)
+def test_neighbours_decide_ties_only_whatever_the_weights(weights, where, finger, expected):
+    line = box_map([0, 0, 1, 1, 2, 2])
+    contacts = torch.zeros(1, len(where), 3)
+    contacts[0, :, 0] = torch.tensor(where)
+    assert vote(line, contacts, torch.tensor([finger]), VotingSettings(2, weights)).item() == expected
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"neighbours": 0},
+        {"weights": (1.0, 1.0)},
+        {"weights": (0.0,) * 6},
+        {"weights": (1.0, 1.0, 1.0, 1.0, 1.0, 0.0)},
+    ],
+)
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(InputError):
         VotingSettings(**wrong)
@@ -186,6 +212,20 @@ def test_contact_semantic_map_names_the_part_that_touches():
     found = contact_semantic_map(points, position, quaternion, joints, hand)
     assert (found[0] == hand.contact_part).float().mean() > 0.97
     assert (contact_semantic_map(points + 0.5, position, quaternion, joints, hand) == 0).all()
+
+
+@pytest.mark.parametrize(("together", "calls"), [(0, 3), (1, 3), (2, 2), (3, 1)])
+def test_as_many_hands_are_looked_at_together_as_the_memory_allows(
+    monkeypatch: pytest.MonkeyPatch, together: int, calls: int
+):
+    hand, seen = HandModel(load_robot("diana7_hit")), []
+    points, joints = torch.rand(50, 3), torch.tensor(hand.robot.postures["home"].hand).float().repeat(3, 1)
+    where = torch.zeros(3, 3), torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(3, 1)
+    whole = contact_semantic_map(points, *where, joints, hand)
+    monkeypatch.setattr(maps, "CHUNK", together * len(points) * len(hand.radius))
+    monkeypatch.setattr(maps, "distance_to_segment", lambda *parts: seen.append(1) or distance_to_segment(*parts))
+    assert torch.equal(contact_semantic_map(points, *where, joints, hand), whole)
+    assert len(seen) == calls
 
 
 def test_contact_semantic_map_is_the_nearest_of_all_capsules():
