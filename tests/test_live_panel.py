@@ -68,7 +68,8 @@ def test_each_widget_asks_for_what_is_written_on_it():
 def test_a_slider_asks_for_its_share_of_the_range(value: float, share: float):
     shown = Shown(state())
     assert shown.asked("x [m]", 0.0) == []
-    assert shown.asked("x [m]", 1e-6) == []
+    assert shown.asked("x [m]", 3e-6) == []
+    assert shown.asked("turn [rad]", 0.25) == []
     for word, moved, expected in (("x [m]", value, (share, 0.5)), ("turn [rad]", 0.5, (share, 1.0))):
         (order,) = shown.asked(word, moved)
         assert isinstance(order, Start)
