@@ -113,6 +113,31 @@ def test_only_pairs_that_are_asked_for_are_read_and_unknown_groups_refused():
         ContactMonitor(scene, GROUPS, pairs=[("a", "d")])
     with pytest.raises(InputError, match="b is in group b and in another one"):
         ContactMonitor(scene, {"a": [A, B], "b": [B]})
+    pair = SimpleNamespace(name="pair", _bodies=[A._bodies[0], D._bodies[0]])
+    with pytest.raises(InputError, match="pair is in group b and in another one"):
+        ContactMonitor(scene, {"a": [A], "b": [pair]})
+
+
+class OnGpu(Scene):
+    """A scene of two environments that tells sums of impulses alone."""
+
+    gpu_sim_enabled, num_envs = True, 2
+
+    def get_pairwise_contact_impulses(self, one: Any, other: Any) -> torch.Tensor:
+        return torch.tensor([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]) * (3.0 if other is D else 1.0)
+
+
+def test_on_a_gpu_impulses_are_known_and_separations_and_points_are_not():
+    monitor = ContactMonitor(OnGpu(), GROUPS | {"d": [D]}, pairs=[("d", "b"), ("b", "c")])
+    found = monitor.take()
+    expected = torch.zeros(2, 4, 4, 3)
+    for first, second, share in ((1, 2, 1.0), (1, 3, 3.0)):
+        expected[:, first, second] = share * torch.tensor([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+        expected[:, second, first] = -expected[:, first, second]
+    torch.testing.assert_close(found.impulse, expected)
+    assert found.separation.isnan().all()
+    position, group = monitor.points(2)
+    assert (position.shape, group.tolist()) == ((2, 2, 3), [[-1, -1]] * 2)
 
 
 @pytest.mark.parametrize("count", [1, 3, 5])
