@@ -141,9 +141,10 @@ def test_an_episode_is_shown_from_its_start_to_its_end(fail_at: int, steps: int)
 def test_a_film_has_the_size_and_the_rate_of_its_task(tmp_path: Path, make: Any, rate: int):
     path = tmp_path / "deep" / "video" / "a.mp4"
     record(make, None, path, 2, first_seed=4)
-    with imageio.get_reader(path) as reader:
-        meta: Any = reader.get_meta_data()
-        frames = [np.asarray(frame) for frame in reader]  # pyright: ignore[reportGeneralTypeIssues]
+    opened: Any = imageio.get_reader(path)
+    with opened as reader:
+        meta = reader.get_meta_data()
+        frames = [np.asarray(frame) for frame in reader]
     assert meta["fps"] == rate
     assert meta["size"] == ((40, 24) if make is Filmed else (32, 32))
     assert len(frames) == 2 * 6

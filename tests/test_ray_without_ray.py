@@ -128,7 +128,7 @@ def test_batches_of_workers_are_joined_and_one_that_is_whole_stays():
 
 
 def test_errors_of_a_cluster_are_told_and_others_left_alone():
-    error = type("RayTaskError", (Exception,), {"__module__": "ray.exceptions"})
+    error: Any = type("RayTaskError", (Exception,), {"__module__": "ray.exceptions"})
     died, failed, refused = error(), error(), error()
     failed.cause, refused.cause = KeyError("x"), InputError("The action is NaN.")
     assert explained(ValueError("x")) is None
