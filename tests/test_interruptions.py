@@ -102,3 +102,93 @@ def test_training_begins_with_the_first_row_of_its_table(tmp_path: Path):
         assert table.read_text() == "a,b\n1,2\n"
         process.kill()
     interruptions.wait_for_rows(tmp_path / "nothing", process)  # it has ended
+
+
+@pytest.mark.parametrize(
+    ("line", "problems", "words"),
+    [
+        (0.34, [], "5.0 s: line 0.3 s, end 2.0 s, status 143, steps 512, left 1: good"),
+        (None, ["a", "b"], "5.0 s: line -, end 2.0 s, status 143, steps 512, left 1: a; b"),
+    ],
+)
+def test_an_interruption_is_told_in_a_line(line: float | None, problems: list[str], words: str):
+    assert str(Outcome(5.0, line, 2.0, 143, 512, LEFT, problems)) == words
+
+
+WAITS = """
+import pathlib, signal, sys, time
+def ends(number, frame):
+    print("Interrupted: saving.", file=sys.stderr, flush=True)
+    time.sleep(0.05)
+    sys.exit(128 + number)
+signal.signal(signal.SIGTERM, ends)
+print("uninterrupted so far", file=sys.stderr, flush=True)
+pathlib.Path(sys.argv[1]).write_text("head\\nrow\\n")
+time.sleep(60)
+"""
+"""A program that says so when it is interrupted, and ends."""
+
+
+@pytest.mark.parametrize("group", [False, True])
+def test_the_line_that_counts_is_the_first_one_after_the_signal(
+    group: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(interruptions, "END", 1.0)
+    words = [sys.executable, "-S", "-c", WAITS, str(tmp_path / "table.csv")]
+    line, end, status, said, process = interruptions.interrupt(
+        words, signal.SIGTERM, 0.0, group, tmp_path / "table.csv"
+    )
+    assert said == "uninterrupted so far\nInterrupted: saving.\n"
+    assert line is not None
+    assert 0 <= line < end < 6
+    assert status == 143
+    assert process > 1
+
+
+def test_a_run_is_interrupted_in_the_folder_and_at_the_moment_that_were_chosen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    asked: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(interruptions, "interrupt", lambda *given: asked.append(given) or (0.1, 1.0, 143, "", 4711))
+    for training in (False, True):
+        outcome = judged(signal.SIGTERM, 5.0, tmp_path, True, ("--env", "E"), training)
+        assert outcome.moment == 5.0
+    judged(signal.SIGTERM, 5.0, tmp_path, True, ("--env", "E"))
+    words = interruptions.command("--env", "E", "--out", str(tmp_path))
+    assert words[1:] == ["-m", "dora", "run", "--env", "E", "--out", str(tmp_path)]
+    assert asked == [(words, signal.SIGTERM, 5.0, True, after) for after in (None, RunFolder(tmp_path).progress, None)]
+
+
+@pytest.mark.parametrize("ends", ["pass", "raise SystemExit('The run has ended.')"])
+def test_a_run_that_goes_on_or_had_ended_is_no_problem(ends: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "config.yaml").touch()
+    monkeypatch.setattr(interruptions, "command", lambda *_: [sys.executable, "-S", "-c", ends])
+    outcome = Outcome(5.0, 0.3, 2.0, 143, None, frozenset({str(tmp_path / "gone")}))
+    resumed(outcome, tmp_path)
+    assert outcome.problems == []
+
+
+@pytest.mark.parametrize(
+    ("words", "problems", "status"),
+    [("", [[], []], 0), ("", [["bad"], []], 1), ("--no-resume --agent ppo --signal KILL", [[], ["bad"]], 1)],
+)
+def test_one_moment_at_which_something_is_wrong_is_enough(
+    words: str, problems: list[list[str]], status: int, monkeypatch: pytest.MonkeyPatch
+):
+    asked: list[tuple[Any, ...]] = []
+    gone_on: list[Path] = []
+
+    def invented(number: int, moment: float, folder: Path, *given: Any) -> Outcome:
+        asked.append((number, moment, *given))
+        assert folder.parent.is_dir()
+        return Outcome(moment, 0.1, 1.0, 143, None, frozenset(), problems[len(asked) - 1])
+
+    monkeypatch.setattr(interruptions, "judged", invented)
+    monkeypatch.setattr(interruptions, "resumed", lambda outcome, folder: gone_on.append(folder))
+    monkeypatch.setattr(sys, "argv", ["interruptions", "--moments", "1", "3", *words.split()])
+    assert interruptions.main() == status
+    options = *SHORT, "--env", "DoraCube-v1", *(("--agent", "ppo") if words else ())
+    number = signal.SIGKILL if words else signal.SIGINT
+    assert asked == [(number, moment, False, options, False) for moment in (1.0, 3.0)]
+    assert len(gone_on) == (0 if words else 2)
+    assert not [folder for folder in gone_on if folder.parent.exists()]
