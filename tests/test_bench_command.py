@@ -139,7 +139,8 @@ def test_settings_of_physics_are_rows_of_a_table_or_of_an_object(
     rows = printed.pop("rows")
     assert printed == {"env": "DoraHammer-v1", "starts": 64, "preset": "none"}
     assert rows == [
-        {"rate": 240.0, "position_iterations": 8, "velocity_iterations": 1, "contact_offset": 0.01, "success": 0.75, "stages": 3.5,
+        {"rate": 240.0, "position_iterations": 8, "velocity_iterations": 1, "contact_offset": 0.01, "success": 0.75,
+         "stages": 3.5,
          "overlap_median_mm": 0.25, "overlap_p95_mm": 1.5, "tunnelled": 0.0, "microseconds": 812.34567}
     ]  # fmt: skip
     assert [(env, len(settings), starts, preset) for env, settings, starts, preset in asked] == [

@@ -15,7 +15,6 @@ from dora.affordance.search.optimise import Settings
 from dora.commands import grasps
 from dora.errors import InputError
 
-
 MADE = ("made", "cube", 3, "usable cube", True, Settings.seat)
 BLIND = ("made", "cube", 0, "usable cube", False, Settings.seat)
 """How sets are made with seed 3, and without a region."""
