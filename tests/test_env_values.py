@@ -88,7 +88,8 @@ def test_pushes_come_after_the_numbers_of_the_sensors():
 
 @pytest.mark.parametrize("name", ["observed_position", "observed_rotation", "observed_joint"])
 def test_one_error_is_enough_to_be_noisy(name: str):
-    assert Randomisation(**{name: 0.01}).noisy
+    only: dict[str, Any] = {name: 0.01}
+    assert Randomisation(**only).noisy
     assert not Randomisation().noisy
 
 
