@@ -110,6 +110,11 @@ class CountingTask:
 class Widget:
     """A part of a page; what it was made with, and what is set, are its attributes."""
 
+    value: Any
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(name)
+
     def __init__(self, **made: Any):
         self.__dict__.update({"visible": True, "removed": False, **made})
         self._called: list[Callable[[Any], None]] = []

@@ -13,6 +13,7 @@ from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector, rotation_angle
 from dora.tasks.hammer.ballistics import LATEST, STEEP, Strike, after_fall, fall_time, slid
 from dora.tasks.hammer.mdp import failed
+from dora.tasks.hammer.reach import REACH, TURN
 from dora.tasks.hammer.reference import CLOSE, TURNED_TIME, CatchReference, CatchSettings, Timing, phases
 from dora.tasks.hammer.task import HammerConfig
 from dora.tasks.hammer.turning import TurnSettings, number_of_roll, roll_at_release
@@ -187,3 +188,34 @@ def test_the_open_hand_waits_a_moment_after_it_begins_to_sink():
     ):
         asked[phase, spent > C.finger_lag] = reference(phase, spent=spent).target(s).hand[0, 0].item()
     assert asked == {("wait", True): 0.0, ("close", False): 0.0, ("close", True): 1.0, ("settle", False): 1.0}
+
+
+SWUNG = C.raised * (1 - (0.1 / C.swing_time) ** 2)
+"""Angle of the hammer after .1 s of a swing [rad]."""
+
+
+@pytest.mark.parametrize(("phase", "angle"), [("raise", C.raised), ("swing", SWUNG)])
+def test_a_blow_is_aimed_a_little_below_the_head_of_the_nail(phase: str, angle: float):
+    """The hammer is in the hand at its own origin; of a swing .1 s will be over in the next step."""
+    made = reference(phase)
+    for _ in range(200 if phase == "raise" else 1):
+        made.phase.index.fill_(PHASES.index(phase))
+        made.buffers.update(spent=torch.full((1,), 0.1 - 2 * DT))
+        made.advance(invented(1))
+    expected, turn = made.strike.hammer(torch.zeros(1), torch.tensor([angle]), -C.through)
+    torch.testing.assert_close(made.buffers.lead_p, expected, atol=1e-4, rtol=0)
+    assert float(rotation_angle(made.buffers.lead_q, turn)) < 1e-3
+
+
+def test_the_waiting_hand_goes_and_turns_so_far_at_most():
+    """Two candidates 10 and 50 cm beside the hand, turned by .3 and by 1 rad; the hand keeps its height."""
+    made = CatchReference(2, Strike(TOP, torch.zeros(2, 3), 0.36), 0.01, DT, "cpu", C)
+    home = torch.tensor([[0.5, -0.1, 0.6]] * 2)
+    made.begin(torch.arange(2), home, IDENTITY.repeat(2, 1))
+    turns = quaternion_from_rotation_vector(torch.tensor([[0.0, 0.0, 0.3], [0.0, 0.0, 1.0]]))
+    goal = home + torch.tensor([[0.1, 0.0, -0.3], [0.5, -0.5, -0.3]])
+    target = made.target(invented(2, goal_p=goal, goal_q=turns, object_p=goal))
+    expected = home + torch.tensor([[0.1, 0.0, 0.0], [REACH[0], -REACH[1], 0.0]])
+    torch.testing.assert_close(target.wrist_p, expected)
+    limited = quaternion_from_rotation_vector(torch.tensor([[0.0, 0.0, 0.3], [0.0, 0.0, TURN]]))
+    torch.testing.assert_close(target.wrist_q, limited, atol=1e-4, rtol=0)

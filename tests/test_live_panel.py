@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from invented_live import SETUP, Gui, state
@@ -51,10 +52,11 @@ def test_each_widget_asks_for_what_is_written_on_it():
     assert shown.asked("Step") == [Step(1)]
     assert shown.asked("Reset") == [Reset(7)]
     assert shown.asked("Push the object") == [Push(0.1, math.pi / 2)]
-    for word, same, other, order in (
+    choices: Any = (
         ("speed", 1.0, 0.5, Speed), ("next episode by itself", True, False, Repeat), ("who acts", "one", "two", Play),
         ("randomisation", "standard", "hard", Randomise),
-    ):  # fmt: skip
+    )  # fmt: skip
+    for word, same, other, order in choices:
         assert shown.asked(word, same) == []
         assert shown.asked(word, other) == [order(other)]
     shown.panel.update(state(seed=7, running=False, candidate=1))

@@ -46,6 +46,7 @@ class Invented(DoraEnv):
     def reset(self, seed: Any = None, options: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         self.__dict__["count"] = 0
         self.resets.append(seed if options is None else options)
+        assert self.chosen_start is not None
         self.placed = self.chosen_start(torch.tensor([[1.0, 2.0]]))
         return torch.full((1, 2), float(len(self.resets))), {}
 

@@ -123,7 +123,7 @@ def exact(mesh: trimesh.Trimesh, queries: np.ndarray) -> tuple[np.ndarray, np.nd
     """Distances (q,) to a mesh, and its nearest points (q, 3) [m]."""
     vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
     square, _, nearest = igl.point_mesh_squared_distance(queries, vertices, faces)[:3]
-    return np.sqrt(square), nearest
+    return np.sqrt(square), np.asarray(nearest)
 
 
 def test_a_grid_interpolates_nearest_points_near_the_mesh_and_distances_elsewhere():
