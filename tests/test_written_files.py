@@ -163,7 +163,7 @@ def test_what_is_half_written_has_an_hour(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("dora.files.time", SimpleNamespace(time=lambda: 1_000_000.0))
     for age, half in halves.items():
         half.touch()
-        os.utime(half, (1_000_000.0 - age,) * 2)
+        os.utime(half, (1_000_000.0 - age, 1_000_000.0 - age))
     stored_or_made(path, Path.read_bytes, lambda: b"made", write_bytes)
     assert [half.exists() for half in halves.values()] == [True, False]
 
