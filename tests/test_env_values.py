@@ -1,5 +1,6 @@
 """What a task draws at random, restores, builds and lets choose: numbers that are worked out anew."""
 
+from dataclasses import replace
 from math import pi
 from types import SimpleNamespace
 from typing import Any
@@ -88,8 +89,7 @@ def test_pushes_come_after_the_numbers_of_the_sensors():
 
 @pytest.mark.parametrize("name", ["observed_position", "observed_rotation", "observed_joint"])
 def test_one_error_is_enough_to_be_noisy(name: str):
-    only: dict[str, Any] = {name: 0.01}
-    assert Randomisation(**only).noisy
+    assert replace(Randomisation(), **{name: 0.01}).noisy
     assert not Randomisation().noisy
 
 

@@ -1,7 +1,6 @@
 """Memory, stages side by side, guidance and bounds of a task on invented states, in numbers."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import pytest
 import torch
@@ -130,12 +129,14 @@ def test_in_the_end_every_arm_has_to_pass_its_last_test():
 def test_tolerance_falls_on_both_sides(x: float, value: float):
     assert tolerance(torch.tensor([x]), (0.0, 1.0), 0.5).tolist() == pytest.approx([value])
     assert tolerance(torch.tensor([x]), (0.0, 1.0)).tolist() == [float(value == 1)]
-    refused: list[dict[str, Any]] = [
-        {"value_at_margin": 0.0}, {"value_at_margin": 1.0}, {"margin": -0.1}, {"bounds": (1.0, 0.9)}
-    ]  # fmt: skip
-    for wrong in refused:
+    for bounds, margin, at_margin in (
+        ((0, 1), 0.5, 0.0),
+        ((0, 1), 0.5, 1.0),
+        ((0, 1), -0.1, 0.1),
+        ((1, 0.9), 0.5, 0.1),
+    ):
         with pytest.raises(ValueError, match="need"):
-            tolerance(torch.tensor([x]), **wrong)
+            tolerance(torch.tensor([x]), bounds, margin, at_margin)
 
 
 # ------------------------------------------------------------------------ guidance

@@ -62,7 +62,7 @@ def test_the_way_is_followed_from_every_node(spread: float, turn: float, count: 
     def way(candidates: Any, p: Tensor, q: Tensor) -> list[tuple[Tensor, Tensor]]:
         assert (p[:, 2] == 0.1).all()
         there = p[:, None] + candidates.position
-        return [(there, q[:, None].expand(-1, 2, 4)), (there - 0.05, q[:, None].expand(-1, 2, 4))]
+        return [(there, q[:, None].expand(-1, 2, 4)), (there - 0.3, q[:, None].expand(-1, 2, 4))]
 
     found = oven_reach(arm, along_x(0.0, 0.2), way, (0.6, 0.3, 0.1), spread, turn)
     assert found.scale.tolist() == near(*[max(spread, 1e-3)] * 2, max(turn, 1e-3))

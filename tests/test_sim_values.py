@@ -197,8 +197,8 @@ def test_a_body_has_the_numbers_of_its_object_unless_others_are_given():
         material = shape.physical_material
         assert (material.static_friction, material.dynamic_friction) == pytest.approx((cube.friction, cube.friction))
         assert material.restitution == 0
-    refused: list[dict[str, Any]] = [{"mass": 0.0}, {"scale": 0.0}, {"friction": -0.1}]
-    for wrong in refused:
+    wrongs: list[dict[str, Any]] = [{"mass": 0.0}, {"scale": 0.0}, {"friction": -0.1}]
+    for wrong in wrongs:
         with pytest.raises(InputError, match=f"{next(iter(wrong))} is .*must be positive"):
             object_entity(cube, **wrong)
     drawn = drawn_box((1.0, 2.0, 3.0), (0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 1.0))
