@@ -129,12 +129,8 @@ def test_in_the_end_every_arm_has_to_pass_its_last_test():
 def test_tolerance_falls_on_both_sides(x: float, value: float):
     assert tolerance(torch.tensor([x]), (0.0, 1.0), 0.5).tolist() == pytest.approx([value])
     assert tolerance(torch.tensor([x]), (0.0, 1.0)).tolist() == [float(value == 1)]
-    for bounds, margin, at_margin in (
-        ((0, 1), 0.5, 0.0),
-        ((0, 1), 0.5, 1.0),
-        ((0, 1), -0.1, 0.1),
-        ((1, 0.9), 0.5, 0.1),
-    ):
+    unit = 0.0, 1.0
+    for bounds, margin, at_margin in ((unit, 0.5, 0.0), (unit, 0.5, 1.0), (unit, -0.1, 0.1), ((1.0, 0.9), 0.5, 0.1)):
         with pytest.raises(ValueError, match="need"):
             tolerance(torch.tensor([x]), bounds, margin, at_margin)
 
