@@ -140,7 +140,8 @@ def test_the_line_that_counts_is_the_first_one_after_the_signal(
     )
     assert said == "uninterrupted so far\nInterrupted: saving.\n"
     assert line is not None
-    assert 0 <= line < end < 6
+    assert 0 <= line < 60  # by a thread, which may be late
+    assert 0 < end < 60
     assert status == 143
     assert process > 1
 
