@@ -221,6 +221,17 @@ def test_tests_that_execute_the_line_come_first_and_once(project: Path, tmp_path
     assert run.asked[2] == ["tests/test_stray.py", f"--deselect={stray}"]
 
 
+def test_tests_that_cannot_be_run_any_more_leave_the_verdict_to_the_rest_of_the_module(project: Path, tmp_path: Path):
+    mutant = next(m for m in drawn(project, 2, 0, ROOM) if m.before == "return a < b")
+    run, gone = _Runner(), "tests/test_sides.py::test_of_former_times"
+
+    def without(copy: Path, arguments: Sequence[str], limit: float) -> Outcome:
+        return Outcome("failed") if gone in arguments else run(copy, arguments, limit)
+
+    judge = Judge(copied(project, tmp_path / "copy"), 60.0, None, without, executing=lambda mutant: [gone])
+    assert judge.judge(mutant) == Trial("caught", "tests/test_sides.py::test_less")
+
+
 def test_a_run_under_coverage_tells_which_tests_execute_a_line(
     project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -133,9 +133,9 @@ class Judge:
         near = {module: place for place, module in enumerate([*own, *others])}
         first = sorted(self.executing(mutant), key=lambda test: near.get(test.partition("::")[0], len(near)))
         stages = [(first, [], self.limit), (own, first, self.limit), (others, first, self.suite_limit)]
-        for tests, done, limit in stages[survived : self.stages]:
+        for k, (tests, done, limit) in list(enumerate(stages))[survived : self.stages]:
             trial = None if limit is None else self._tried(mutant, tests, done, limit)
-            if trial is not None:
+            if trial is not None and (k > 0 or trial.verdict != "unjudged"):  # the rest of the module's may judge it
                 return trial
         return Trial("survived", stages=max(self.stages, survived))
 
