@@ -122,6 +122,20 @@ def test_numbers_that_are_unpacked_are_counted_by_chunks(
         found.episode(0)
 
 
+@pytest.mark.parametrize(("arrays", "intact"), [(8, True), (9, False)])
+def test_arrays_of_one_number_a_row_are_counted_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arrays: int, intact: bool
+):
+    """One number counts as 100, too, and the actions 200."""
+    monkeypatch.setattr(recordings, "MOST_NUMBERS", 1000)
+    found = written(tmp_path, {"actions": ACTIONS, **dict.fromkeys([f"env_states/{k}" for k in range(arrays)], [0.0])})
+    if intact:
+        assert found.episode(0).state
+        return
+    with pytest.raises(InputError, match="unpack to more than 1000 numbers"):
+        found.episode(0)
+
+
 @pytest.mark.parametrize(("size", "intact"), [(200, True), (199, False)])
 def test_an_array_may_have_just_as_many_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int, intact: bool
