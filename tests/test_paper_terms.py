@@ -126,7 +126,7 @@ def test_a_printed_term_grows_in_its_direction_and_in_its_stages(task: str, name
     worse, better = term.value(STATES[task](**pair, **paid)).tolist()
     assert 0 <= worse < better - 1e-3
     assert better <= 1
-    assert (term.weight < 0) == (term.part == "penalty")
+    assert term.weight == (-0.1 if term.part == "penalty" else 1.0)
     if unpaid is not None:
         assert term.value(STATES[task](**pair, **unpaid)).tolist() == [0.0, 0.0]
 
