@@ -263,6 +263,14 @@ def test_differences_to_zero_correction_are_paired_where_the_episodes_are_there(
     assert jug.startswith("+40.0 [+3")
 
 
+def test_stages_are_means_over_the_seeds_that_tell_them(tmp_path: Path):
+    for seed, success in ((10, 0.9), (11, 0.7)):
+        write_run(tmp_path / str(seed), "DoraJug-v1", "ppo", "affordance", success, seed)
+    write_run(tmp_path / "none", "DoraCube-v1", "ppo", "affordance", 0.9, stage_rates={})
+    (row,) = table(tmp_path, "Sub-tasks")
+    assert row[-1] == "grasp 90.0, lift 80.0"
+
+
 def test_cells_beside_the_paper_have_the_same_and_the_largest_budget(tmp_path: Path):
     write_run(tmp_path / "a", "DoraJug-v1", "sac", "affordance", 0.9, total_steps=300_000)
     write_run(tmp_path / "b", "DoraJug-v1", "sac", "affordance", 0.1, total_steps=20_000)

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import pi
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from dora.geometry.rotations import (
 from dora.robot.shapes import Shape
 from dora.sim.substeps import watch_physics
 from dora.tasks.hammer.ballistics import Strike
-from dora.tasks.hammer.nail import drawn_links, driven_by_momentum, struck
+from dora.tasks.hammer.nail import Nail, drawn_links, driven_by_momentum, struck
 from dora.tasks.hammer.snapshot import HAND_CENTRE
 from dora.tasks.hammer.task import HammerConfig, HammerTask
 
@@ -146,6 +147,25 @@ def test_momentum_drives_a_nail_as_far_as_its_equation_says(resistance: float, d
         depth += dt * speed
         speed -= dt * (resistance + drag * speed) / mass
     assert wanted == pytest.approx(depth, rel=2e-3)
+
+
+def test_a_blow_that_goes_on_reaches_as_far_as_its_hardest_moment():
+    """Of its reach 3 mm are driven already; a weaker moment adds nothing, a harder one the difference."""
+    nail: Any = Nail.__new__(Nail)
+    nail.settings, nail._hammers = CONFIG.nail, [SimpleNamespace(mass=0.5)]
+    nail._left, nail._reach, nail._since = (np.zeros(1) for _ in range(3))
+    mass = 0.5 + CONFIG.nail.hand
+    slow, fast = (driven_by_momentum(CONFIG.nail, struck(CONFIG.nail, v, 0.0, mass), mass) for v in (1.0, 1.5))
+    assert 0.003 < slow < fast
+    nail._strike(0, 1.0, 0.0)
+    assert nail._left[0] == nail._reach[0] == slow
+    nail._left -= 0.003
+    nail._strike(0, 0.5, 0.0)
+    assert nail._reach[0] == slow
+    assert nail._left[0] == pytest.approx(slow - 0.003)
+    nail._strike(0, 1.5, 0.0)
+    assert nail._reach[0] == fast
+    assert nail._left[0] == pytest.approx(fast - 0.003)
 
 
 def test_an_impact_keeps_the_momentum_of_nail_and_hammer():

@@ -128,7 +128,7 @@ def test_arrays_of_one_number_a_row_are_counted_too(
 ):
     """One number counts as 100, too, and the actions 200."""
     monkeypatch.setattr(recordings, "MOST_NUMBERS", 1000)
-    found = written(tmp_path, {"actions": ACTIONS, **dict.fromkeys([f"env_states/{k}" for k in range(arrays)], [0.0])})
+    found = written(tmp_path, {"actions": ACTIONS, **{f"env_states/{k}": [0.0] for k in range(arrays)}})
     if intact:
         assert found.episode(0).state
         return
