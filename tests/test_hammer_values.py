@@ -71,7 +71,8 @@ def test_a_hammer_has_fallen_below_its_height(height: float, expected: bool):
 
 @pytest.mark.parametrize("taken", [{"arrives": (0.0, pi)}, {"arrives": (0.7, 0.7)}, {"least": pi}, {"least": 1e-3}])
 def test_turns_at_their_limits_are_taken(taken: dict[str, Any]):
-    TurnSettings(**taken)
+    made = TurnSettings(**taken)
+    assert {name: getattr(made, name) for name in taken} == taken
 
 
 @pytest.mark.parametrize(

@@ -226,10 +226,13 @@ def test_tests_that_cannot_be_run_any_more_leave_the_verdict_to_the_rest_of_the_
     run, gone = _Runner(), "tests/test_sides.py::test_of_former_times"
 
     def without(copy: Path, arguments: Sequence[str], limit: float) -> Outcome:
-        return Outcome("failed") if gone in arguments else run(copy, arguments, limit)
+        if gone in arguments:
+            return Outcome("failed")
+        return Outcome("passed") if f"--deselect={there}" in arguments else run(copy, arguments, limit)
 
-    judge = Judge(copied(project, tmp_path / "copy"), 60.0, None, without, executing=lambda mutant: [gone])
-    assert judge.judge(mutant) == Trial("caught", "tests/test_sides.py::test_less")
+    there = "tests/test_sides.py::test_less"
+    judge = Judge(copied(project, tmp_path / "copy"), 60.0, None, without, executing=lambda mutant: [gone, there])
+    assert judge.judge(mutant) == Trial("caught", there)
 
 
 def test_a_run_under_coverage_tells_which_tests_execute_a_line(

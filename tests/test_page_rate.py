@@ -156,5 +156,8 @@ def test_without_viser_a_sentence_says_what_to_install(monkeypatch: pytest.Monke
 
 
 def test_a_free_port_can_be_taken():
+    port = free_port()
     with socket.socket() as taken:
-        taken.bind(("127.0.0.1", free_port()))
+        taken.bind(("127.0.0.1", port))
+        assert taken.getsockname() == ("127.0.0.1", port)
+    assert port > 0

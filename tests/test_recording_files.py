@@ -105,32 +105,21 @@ def test_arrays_and_groups_of_the_states_are_counted(
 
 
 @pytest.mark.parametrize(
-    ("actions", "arrays", "intact"),
-    [("actions", 8, True), ("actions", 9, False), ("chunked", 7, True), ("chunked", 8, False)],
-)
+    ("actions", "shape", "arrays", "intact"),
+    [
+        ("actions", (2, 13), 8, True), ("actions", (2, 13), 9, False), ("actions", (1,), 8, True),
+        ("actions", (1,), 9, False), ("chunked", (2, 13), 7, True), ("chunked", (2, 13), 8, False),
+    ],
+)  # fmt: skip
 def test_numbers_that_are_unpacked_are_counted_by_chunks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, actions: str, arrays: int, intact: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, actions: str, shape: tuple[int, ...], arrays: int, intact: bool
 ):
-    """Each small array counts 100, and the actions 200, or in three chunks of 4 steps, of which each counts 100."""
+    """Each small array counts 100, also of one number, and the actions 200, or in three chunks of 4 steps 300."""
     monkeypatch.setattr(recordings, "MOST_NUMBERS", 1000)
     names = [f"env_states/{k}" for k in range(arrays)]
-    found = written(tmp_path, {actions: ACTIONS, **dict.fromkeys(names, np.zeros((2, 13)))})
+    found = written(tmp_path, {actions: ACTIONS, **dict.fromkeys(names, np.zeros(shape))})
     if intact:
         assert found.episode(0).actions.tolist() == ACTIONS.tolist()
-        return
-    with pytest.raises(InputError, match="unpack to more than 1000 numbers"):
-        found.episode(0)
-
-
-@pytest.mark.parametrize(("arrays", "intact"), [(8, True), (9, False)])
-def test_arrays_of_one_number_a_row_are_counted_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arrays: int, intact: bool
-):
-    """One number counts as 100, too, and the actions 200."""
-    monkeypatch.setattr(recordings, "MOST_NUMBERS", 1000)
-    found = written(tmp_path, {"actions": ACTIONS, **{f"env_states/{k}": [0.0] for k in range(arrays)}})
-    if intact:
-        assert found.episode(0).state
         return
     with pytest.raises(InputError, match="unpack to more than 1000 numbers"):
         found.episode(0)

@@ -132,10 +132,16 @@ class Judge:
         own, others = tests_of(self.copy, mutant.module)
         near = {module: place for place, module in enumerate([*own, *others])}
         first = sorted(self.executing(mutant), key=lambda test: near.get(test.partition("::")[0], len(near)))
-        stages = [(first, [], self.limit), (own, first, self.limit), (others, first, self.suite_limit)]
-        for k, (tests, done, limit) in list(enumerate(stages))[survived : self.stages]:
+        stages = [(first, self.limit), (own, self.limit), (others, self.suite_limit)]
+        done: Sequence[str] = []
+        for tests, limit in stages[survived : self.stages]:
             trial = None if limit is None else self._tried(mutant, tests, done, limit)
-            if trial is not None and (k > 0 or trial.verdict != "unjudged"):  # the rest of the module's may judge it
+            if tests is not first:
+                if trial is not None:
+                    return trial
+            elif trial is None:
+                done = first
+            elif trial.verdict != "unjudged":  # else its module's tests judge it, all of them
                 return trial
         return Trial("survived", stages=max(self.stages, survived))
 
