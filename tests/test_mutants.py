@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dora.errors import InputError
-from dora.tools.mutants import ROOMS, drawn, judge_all, judged
+from dora.tools.mutants import ROOMS, chosen, drawn, judge_all, judged
 from dora.tools.mutation.executions import executed, statement_lines
 from dora.tools.mutation.matching import tests_of as matching_tests
 from dora.tools.mutation.sites import mutants_of
@@ -114,6 +114,15 @@ def test_the_draw_follows_from_the_seed_and_visits_every_room(project_root: Path
     for patterns in ROOMS.values():
         files = {str(path.relative_to(project_root)) for each in patterns for path in project_root.glob(each)}
         assert sum(mutant.module in files for mutant in first) == 2
+
+
+def test_rooms_are_chosen_by_name_with_those_inside():
+    rooms = {"agents": ("a",), "agents.runs": ("b",), "agents_of_others": ("c",), "files": ("d",)}
+    assert chosen((), rooms) == rooms
+    assert list(chosen(("agents",), rooms)) == ["agents", "agents.runs"]
+    assert chosen(("files", "agents.runs"), rooms) == {"agents.runs": ("b",), "files": ("d",)}
+    with pytest.raises(InputError, match=r"no room 'agent'; the rooms are agents, agents\.runs"):
+        chosen(("files", "agent"), rooms)
 
 
 def test_more_mutants_than_there_are_are_refused(project: Path):

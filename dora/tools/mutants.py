@@ -1,12 +1,13 @@
 """How many small deliberate faults of the source the tests notice.
 
     python -m dora.tools.mutants --count 40 --seed 0 --out runs/mutants
+    python -m dora.tools.mutants --count 40 --seed 0 --out runs/mutants --rooms tasks agents affordance.maps files
 
-Draws mutants (a comparison turned, a sign, an `and` for an `or`, a number changed ...), equally many in each room, and
-runs in a temporary copy of the repository the tests that execute its line, then, as long as all pass, those of its
-module, and the rest of the suite. Which tests execute a line is found by one run under coverage, kept in OUT. The
-working tree is not changed. Results are appended to OUT/mutants.jsonl; those that are there are not judged
-again. The exit status is 1 if fewer than 90 % are caught.
+Draws mutants (a comparison turned, a sign, an `and` for an `or`, a number changed ...), equally many in each room, or
+in those that are named, and runs in a temporary copy of the repository the tests that execute its line, then, as long
+as all pass, those of its module, and the rest of the suite. Which tests execute a line is found by one run under
+coverage, kept in OUT. The working tree is not changed. Results are appended to OUT/mutants.jsonl; those that are there
+are not judged again. The exit status is 1 if fewer than 90 % are caught.
 """
 
 import functools
@@ -50,7 +51,7 @@ ROOMS = {
     "sweeps": ("dora/sweeps/*.py",),
     "policies": ("dora/policies/*.py",),
     "commands": ("dora/commands/*.py",),
-    "files, configs, digests": ("dora/files.py", "dora/configs.py", "dora/digests.py"),
+    "files": ("dora/files.py", "dora/configs.py", "dora/digests.py"),
 }
 """Files of the rooms whose faults are drawn, each room as often as any other. The rest (batched physics, grasp search,
 robots, tools) is not drawn from: its tests compare numbers with another implementation, and take longest."""
@@ -72,6 +73,8 @@ class Args:
     """How many are drawn."""
     seed: int = 0
     """Seed of the draw."""
+    rooms: tuple[str, ...] = ()
+    """Rooms drawn from, each with the rooms inside it (`agents` with `agents.runs`); without one, all."""
     out: Path = Path("runs/mutants")
     """Folder of the results."""
     list: bool = False
@@ -89,6 +92,23 @@ class Args:
     """Longest run of the rest of the suite [s]."""
     processes: int = 2
     """Worker processes of the tests; 0 runs them in one process."""
+
+
+def chosen(names: Sequence[str], rooms: Mapping[str, Sequence[str]] = ROOMS) -> dict[str, Sequence[str]]:
+    """Rooms that are named, each with the rooms inside it; all where none is named.
+
+    Raises:
+        InputError: there is no room of a name.
+    """
+    unknown = [name for name in names if not any(_is_inside(room, name) for room in rooms)]
+    if unknown:
+        raise InputError(f"there is no room {unknown[0]!r}; the rooms are {', '.join(rooms)}.")
+    return {room: files for room, files in rooms.items() if not names or any(_is_inside(room, n) for n in names)}
+
+
+def _is_inside(room: str, name: str) -> bool:
+    """Whether a room is the one of a name, or inside it."""
+    return f"{room}.".startswith(f"{name}.")
 
 
 def drawn(root: Path, count: int, seed: int, rooms: Mapping[str, Sequence[str]] = ROOMS) -> list[Mutant]:
@@ -186,7 +206,7 @@ def main() -> int:
     """Draw, judge, and print the table; the exit status."""
     args = tyro.cli(Args, description=__doc__)
     root = Path(__file__).parents[2]
-    mutants = drawn(root, args.count, args.seed)
+    mutants = drawn(root, args.count, args.seed, chosen(args.rooms))
     if args.list:
         print(text_table(HEAD, rows(mutants, {})))
         return 0
