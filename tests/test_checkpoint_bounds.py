@@ -165,6 +165,16 @@ def test_a_header_that_does_not_fit_is_refused(tmp_path: Path, entry: dict[str, 
     assert read_checkpoint(path).config == CONFIG
 
 
+def test_a_checkpoint_of_an_earlier_version_may_have_numbers_that_are_refused_today(tmp_path: Path):
+    path = tmp_path / "a.safetensors"
+    for earlier in ({"eval_episodes": 100_000}, {"final_episodes": 10**6}, {"learner": PPOConfig(log_std=0.5)}):
+        config = dataclasses.replace(CONFIG, **earlier)
+        with pytest.raises(InputError):
+            check(config)
+        Checkpoint(config, (4, 2), {"w": torch.zeros(2)}).write(path)
+        assert read_checkpoint(path).config == config
+
+
 def test_a_checkpoint_holds_the_networks_and_two_moments_of_each_parameter():
     module = nn.BatchNorm1d(3)  # parameters: 2 * 3 floats; buffers: 2 * 3 floats and a whole number of 8 bytes
     adam = torch.optim.Adam(module.parameters())

@@ -8,6 +8,7 @@ from invented import TIP_RADIUS, invented
 from torch import Tensor
 
 import dora.tasks as tasks
+from dora.affordance.bundled_sets import load_candidates
 from dora.tasks import cube
 from dora.tasks.cube import CubeConfig
 from dora.tasks.mdp.snapshot import Snapshot, derived
@@ -31,6 +32,18 @@ def test_surface_distance_is_that_of_a_box():
     tips[0, 4, 1] = 0.07  # diagonal: 4 cm beside an edge
     expected = torch.tensor([[-0.03, -0.01, 0.0, 0.05, 0.04]]) - TIP_RADIUS
     torch.testing.assert_close(cube.box_distance(invented(1, tip_p=tips)), expected)
+
+
+@pytest.mark.parametrize(
+    ("optimised", "region", "by_hand"),
+    [(False, True, True), (True, True, False), (False, False, False), (True, False, False)],
+)
+def test_the_grasp_that_is_made_by_hand_is_for_affordance_alone(optimised: bool, region: bool, by_hand: bool):
+    found = cube.CubeTask(CubeConfig(optimised=optimised)).candidates("", region)
+    assert (found.ranking_steps is None) == by_hand
+    if not by_hand:
+        searched = load_candidates("cube", region=region).position.tolist()
+        assert all(position in searched for position in found.position.tolist())
 
 
 def test_lifting_pays_until_the_target_height_and_more_with_an_opposed_grasp():

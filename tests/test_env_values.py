@@ -1,5 +1,6 @@
 """What a task draws at random, restores, builds and lets choose: numbers that are worked out anew."""
 
+import contextlib
 from dataclasses import replace
 from math import pi
 from types import SimpleNamespace
@@ -17,11 +18,11 @@ from dora.affordance.reach.feasibility_table import Grid
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_from_yaw
 from dora.tasks.cube import CubeConfig, CubeTask
-from dora.tasks.env import options
+from dora.tasks.env import options, scene
 from dora.tasks.env.episode_start import SCALE_DRAW, drawn_sizes
 from dora.tasks.env.options import check_grasps, choose_render_backend, numbers_under_preset, task_config
 from dora.tasks.env.perturbations import KEYS, OBJECT_DRAWS, STILL, Perturbations, uniform
-from dora.tasks.env.scene import film_camera, sim_config
+from dora.tasks.env.scene import film_camera, freeing_the_old_scene, sim_config
 from dora.tasks.env.starts import TRIES, standing, standing_starts
 from dora.tasks.env.task import short_name
 from dora.tasks.guidance.candidate_choice import CandidateChoice
@@ -278,6 +279,23 @@ def test_the_physics_is_that_of_the_numbers():
     assert (scene.contact_offset, scene.solver_position_iterations, scene.solver_velocity_iterations) == (0.004, 7, 1)
     assert (scene.sleep_threshold, scene.enable_pcm) == (0.0, False)
     assert (material.static_friction, material.dynamic_friction) == (0.9, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "collected"), [("a", "a", 0), ("a", "b", 1), ("a", None, 1), (None, "b", 0), (None, None, 0)]
+)
+@pytest.mark.parametrize("fails", [False, True])
+def test_an_old_scene_is_collected_once_it_is_no_longer_the_tasks(
+    before: str | None, after: str | None, collected: int, fails: bool, monkeypatch: pytest.MonkeyPatch
+):
+    calls: list[None] = []
+    monkeypatch.setattr(scene.gc, "collect", lambda: calls.append(None))
+    env = SimpleNamespace(scene=before)
+    with contextlib.suppress(KeyError), freeing_the_old_scene(env):
+        env.scene = after
+        if fails:
+            raise KeyError
+    assert len(calls) == collected
 
 
 def test_films_are_square_and_look_from_the_eye_at_the_target():
