@@ -46,6 +46,20 @@ def test_the_grasp_that_is_made_by_hand_is_for_affordance_alone(optimised: bool,
         assert all(position in searched for position in found.position.tolist())
 
 
+@pytest.mark.parametrize(
+    ("touching", "rise", "expected"),
+    [((0, 2), 0.11, True), ((0, 4), 0.11, True), ((0, 2), 0.09, False), ((1, 2), 0.11, False), ((0, 5), 0.11, False)],
+)
+def test_an_object_is_held_between_thumb_and_finger_off_the_table(
+    touching: tuple[int, ...], rise: float, expected: bool
+):
+    """5 is the palm."""
+    touch = torch.zeros(1, 6, dtype=torch.bool)
+    touch[0, list(touching)] = True
+    s = invented(1, touch=touch, object_p=torch.tensor([[0.0, 0.0, rise]]))
+    assert cube.CubeTask(CubeConfig()).held(s).tolist() == [expected]
+
+
 def test_lifting_pays_until_the_target_height_and_more_with_an_opposed_grasp():
     rise = torch.tensor([0.0, 0.05, 0.10, 0.40])
     p = torch.zeros(4, 3)

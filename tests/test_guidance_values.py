@@ -74,6 +74,17 @@ STEPS: dict[str, tuple[int, dict[str, float], tuple[float, ...]]] = {
 """Phase, ramps before a control step, and after it."""
 
 
+@pytest.mark.parametrize(("phase", "above"), [(APPROACH, 0.06 * 0.5), (DESCEND, 0.0)])
+def test_a_hand_that_has_to_turn_comes_higher(phase: int, above: float):
+    """By 6 cm for each radian, and by nothing once it goes down; .1 m before the candidate, which is below."""
+    made = GraspReference(1, DT, CPU, replace(C, hover=0.06))
+    s = at_goal(wrist_q=quaternion_from_rotation_vector(torch.tensor([[0.0, 0.3, 0.4]])))
+    made.begin(torch.arange(1), s.hand.wrist_p, s.hand.wrist_q)
+    made.phase.index.fill_(phase)
+    made.buffers.update(standoff=torch.tensor([0.1]))
+    assert made.target(s).wrist_p[0].tolist() == pytest.approx([0.4, 0.1, 0.3 + above])
+
+
 @pytest.mark.parametrize("name", STEPS)
 def test_a_ramp_moves_on_by_its_speed_in_its_phase_alone(name: str):
     phase, before, after = STEPS[name]

@@ -11,11 +11,12 @@ from torch import Tensor
 
 from dora.errors import InputError
 from dora.geometry.rotations import quaternion_from_rotation_vector, rotation_angle
+from dora.tasks.cube import CubeTask
 from dora.tasks.hammer.ballistics import LATEST, STEEP, Strike, after_fall, fall_time, slid
 from dora.tasks.hammer.mdp import failed
 from dora.tasks.hammer.reach import REACH, TURN
 from dora.tasks.hammer.reference import CLOSE, TURNED_TIME, CatchReference, CatchSettings, Timing, phases
-from dora.tasks.hammer.task import HammerConfig
+from dora.tasks.hammer.task import HammerConfig, HammerTask
 from dora.tasks.hammer.turning import TurnSettings, number_of_roll, roll_at_release
 
 C, DT = CatchSettings(), 0.025
@@ -26,6 +27,28 @@ TOP = torch.tensor([0.6, -0.1, 0.3])
 
 def near(*expected: float) -> Any:
     return pytest.approx(list(expected), abs=1e-5)
+
+
+# ------------------------------------------------------------------------ what is held
+
+
+@pytest.mark.parametrize(
+    ("touching", "height", "expected"),
+    [((0, 3), 1e-3, True), ((1, 2), 1e-3, True), ((1, 2, 3), 1e-3, True), ((0, 3), -1e-3, False), ((2,), 1e-3, False),
+     ((2, 5), 1e-3, False), ((), 1e-3, False)],
+)  # fmt: skip
+def test_a_hammer_is_held_by_two_fingers_above_the_ground(touching: tuple[int, ...], height: float, expected: bool):
+    """Whichever fingers they are; 5 is the palm."""
+    touch = torch.zeros(1, 6, dtype=torch.bool)
+    touch[0, list(touching)] = True
+    config = HammerConfig()
+    s = invented(1, touch=touch, object_p=torch.tensor([[0.0, 0.0, config.fallen + height]]))
+    assert HammerTask(config).held(s).tolist() == [expected]
+
+
+def test_contacts_of_a_hammer_are_collected_in_every_physics_step():
+    assert HammerTask.CONTACT_EVERY_STEP
+    assert not CubeTask.CONTACT_EVERY_STEP
 
 
 # ------------------------------------------------------------------------ falls

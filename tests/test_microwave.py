@@ -1,6 +1,6 @@
 """DoraMicrowave-v1: geometry and references on invented states, and what the scripted solution does."""
 
-from math import pi
+from math import pi, radians
 from typing import Any
 
 import numpy as np
@@ -11,16 +11,20 @@ from placements import grasps
 from torch import Tensor
 
 import dora.tasks as tasks
+from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.candidates import hand_digest
 from dora.affordance.objects.catalogue import load_object
 from dora.geometry.poses import compose
 from dora.geometry.rotations import (
     quaternion_apply,
     quaternion_from_rotation_vector,
+    quaternion_from_yaw,
     quaternion_multiply,
     rotation_angle,
 )
 from dora.robot import load_robot
+from dora.tasks.env.options import task_config
+from dora.tasks.env.starts import STANDING_DRAWS
 from dora.tasks.microwave import mdp
 from dora.tasks.microwave.mdp import MicrowaveConfig
 from dora.tasks.microwave.reach import STEP, placing_way
@@ -189,6 +193,54 @@ def test_microwaves_differ_and_start_shut(task: Any):
     assert (s.oven_p[:, :2] - torch.tensor(CONFIG.oven[:2])).abs().max() <= 0.04
     assert s.door.abs().max() < 1e-3
     assert len({round(float(x), 5) for x in task.task.oven.get_state()["damping"]}) == 4
+
+
+@pytest.mark.parametrize("shares", [(0.5,) * 6, (1.0, 0.0, 0.75, 0.0, 1.0, 0.25), (0.25, 0.75, 0.0, 1.0, 0.5, 0.0)])
+def test_shares_that_are_drawn_say_where_a_microwave_stands_and_how_it_resists(task: Any, shares: tuple[float, ...]):
+    """x, y, yaw, damping, friction, latch: half is the nominal number, 0 and 1 are the ends of its range."""
+    task.reset(seed=1)
+    begun: dict[str, Tensor] = {}
+    names = ("rows", "p", "q", "damping", "friction", "latch")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(task.task.oven, "begin", lambda *values: begun.update(zip(names, values, strict=True)))
+        u = torch.tensor([[0.5] * STANDING_DRAWS + list(shares)])
+        task.task.place(task.task_scene, torch.tensor([2]), u)
+    x, y, yaw, *ways = (2 * share - 1 for share in shares)
+    hinge = oven_mount().hinge
+    expected = torch.tensor([[0.70 + 0.04 * x, 0.04 * y, 0.10]])
+    torch.testing.assert_close(begun["p"], expected)
+    torch.testing.assert_close(begun["q"], quaternion_from_yaw(torch.tensor([radians(10) * yaw])))
+    nominal = (hinge.damping, hinge.friction, hinge.latch)
+    for name, number, way in zip(names[3:], nominal, ways, strict=True):
+        assert begun[name].tolist() == pytest.approx([number * (1 + 0.5 * way)])
+    task.reset(seed=1)
+
+
+def test_arms_have_candidates_of_their_own():
+    made = tasks.find_task("DoraMicrowave-v1")(CONFIG)
+    left, right = load_robot("diana7_hit_left"), load_robot("diana7_hit")
+    handle, cube = made.candidates(LEFT), made.candidates(RIGHT)
+    assert (handle.object, cube.object) == ("microwave", "cube")
+    ranked = load_candidates("cube", task="DoraMicrowave-v1").position.tolist()
+    assert all(position in ranked for position in cube.position.tolist())
+    blind = load_candidates("cube", region=False).position.tolist()
+    assert all(position in blind for position in made.candidates(RIGHT, region=False).position.tolist())
+    assert made.adapted(cube, RIGHT, right) is cube
+    assert made.adapted(handle, LEFT, right) is handle
+    image = made.adapted(handle, LEFT, left)
+    flip = torch.tensor([1.0, -1.0, 1.0])
+    for mine, other in ((image.approach, handle.approach), (image.contacts, handle.contacts)):
+        torch.testing.assert_close(mine, other * flip, atol=0, rtol=0, equal_nan=True)
+    assert made.adapted(image, LEFT, left) is image
+    assert made.start_grid(LEFT) is None
+    grid = made.start_grid(RIGHT)
+    assert grid is not None
+    assert (grid.centre, grid.spread) == (CONFIG.centre, (CONFIG.spread,) * 2)
+    nominal, share = torch.tensor([2.0]), torch.tensor([1.0])
+    assert made.masses("microwave", nominal, share) is nominal
+    varied = MicrowaveTask(task_config(MicrowaveConfig, "standard", None))
+    assert varied.masses("microwave", nominal, share) is nominal
+    assert varied.masses("cube", nominal, share) > nominal
 
 
 def test_the_handle_is_the_object_of_the_left_arm_and_no_part_of_the_world(task: Any):
