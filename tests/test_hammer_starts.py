@@ -86,7 +86,7 @@ def test_a_nail_counts_physics_steps_and_a_window_control_steps(monkeypatch: pyt
 
     monkeypatch.setattr(hammer, "Nail", nail)
     config = replace(C, window=0.2)
-    own = HammerTask(config)
+    own: Any = HammerTask(config)
     scene: Any = SimpleNamespace(device=torch.device("cpu"), num_envs=2, scene=None, build=lambda *_, **__: None)
     build: Any = inspect.unwrap(HammerTask.build)  # without the check of types: this scene is invented
     build(own, scene, "hammer", torch.tensor([1.0, SIZE]).numpy())

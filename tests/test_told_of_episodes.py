@@ -57,7 +57,10 @@ def test_columns_of_the_observation_are_counted_through():
 
 
 def test_a_stage_is_held_for_a_control_step_at_least():
-    stages = [Stage[Any]("reach", bool), Stage[Any]("hold", bool, hold=0.5, lost=bool, back_to="reach")]
+    def never(_: Any) -> Tensor:
+        return torch.tensor([False])
+
+    stages = [Stage[Any]("reach", never), Stage[Any]("hold", never, hold=0.5, lost=never, back_to="reach")]
     rows = description.stage_rows(environment(machine=SimpleNamespace(stages=stages)))
     assert rows[1:] == [["`reach`", "0.05", "never"], ["`hold`", "0.5", "`reach`"]]
 
