@@ -53,6 +53,8 @@ def test_each_quarter_is_a_point_with_its_interval(monkeypatch: pytest.MonkeyPat
     assert [other.axison for other in figure.axes] == [True, False, False]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [ours.get_label(), theirs.get_label()]
     assert figure.get_suptitle() == "DoraJug-v1, preset standard: success in quarters of the episodes"
+    named = [*figure.texts, axis.xaxis.label, *figure.legends[0].get_texts()]
+    assert not any(text.get_parse_math() for text in named)  # a $ of a name stays one
 
 
 @pytest.mark.parametrize(("count", "down"), [(0, 1), (1, 1), (3, 1), (4, 2), (7, 3)])
