@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import dora.sim
+from dora.tasks import make_task
 
 pytestmark = pytest.mark.usefixtures("materials")
 STEPS = 100
@@ -109,6 +110,30 @@ def test_every_row_of_a_batch_equals_stock():
         for action, state in zip(actions, states, strict=True):
             stock.step(action[i])
             assert_equal(stock.unwrapped.get_state_dict(), row(state, i), f"row {i}")
+
+
+@pytest.mark.slow
+def test_two_robots_of_ours_equal_stock_in_every_row_until_they_hold_handle_and_cube():
+    """Random corrections of a reference that takes the handle with one hand and the cube with the other; rewards
+    are sums that are added up in another order with more rows."""
+    seeds = [6, 7, 8]
+    ours = make_task("DoraMicrowave-v1", len(seeds), preset="standard")
+    stock = make_task("DoraMicrowave-v1", 1, preset="standard", sim_backend="physx_cpu")
+    before = ours.reset(seed=seeds)[0]
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (90, ours.action_size)).astype(np.float32)
+    results = [ours.step(torch.as_tensor(action).expand(len(seeds), -1)) for action in actions]
+    touched: set[str] = set()
+    for i, seed in enumerate(seeds):
+        assert_equal(stock.reset(seed=[seed])[0], before[i : i + 1], f"row {i}, reset")
+        for step, (action, result) in enumerate(zip(actions, results, strict=True)):
+            observation, reward, *_ = stock.step(torch.as_tensor(action)[None])
+            assert_equal(observation, result[0][i : i + 1], f"row {i}, step {step}")
+            np.testing.assert_allclose(reward, result[1][i : i + 1], atol=1e-6)
+        assert_equal(
+            stock.get_state_dict()["articulations"], row(ours.get_state_dict(), i)["articulations"], f"row {i}"
+        )
+        touched |= {arm for arm, hand in stock.snapshot.hands.items() if hand.touch[0, :-1].any()}
+    assert touched == {"left", "right"}, "a parity without contacts says little"
 
 
 def test_state_copied_into_all_rows_gives_identical_rows():
