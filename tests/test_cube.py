@@ -57,7 +57,7 @@ def test_an_object_is_held_between_thumb_and_finger_off_the_table(
     touch = torch.zeros(1, 6, dtype=torch.bool)
     touch[0, list(touching)] = True
     s = invented(1, touch=touch, object_p=torch.tensor([[0.0, 0.0, rise]]))
-    assert cube.CubeTask(CubeConfig()).held(s).tolist() == [expected]
+    assert cube.CubeTask(CubeConfig()).held(s, "arm").tolist() == [expected]
 
 
 def test_lifting_pays_until_the_target_height_and_more_with_an_opposed_grasp():

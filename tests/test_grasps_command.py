@@ -80,7 +80,6 @@ def script() -> ModuleType:
         ("--contact-maps --rank-in-task --object cube", "--contact-maps goes alone"),
         ("--object cube --any-region", "a search takes --region any"),
         ("--rank-in-task --object spoon", "no object 'spoon'"),
-        ("--rank-in-task --any-region --object microwave", "DoraMicrowave-v1 has several arms"),
     ],
 )
 def test_bad_input(

@@ -43,7 +43,7 @@ def test_a_hammer_is_held_by_two_fingers_above_the_ground(touching: tuple[int, .
     touch[0, list(touching)] = True
     config = HammerConfig()
     s = invented(1, touch=touch, object_p=torch.tensor([[0.0, 0.0, config.fallen + height]]))
-    assert HammerTask(config).held(s).tolist() == [expected]
+    assert HammerTask(config).held(s, "arm").tolist() == [expected]
 
 
 def test_contacts_of_a_hammer_are_collected_in_every_physics_step():

@@ -223,7 +223,7 @@ def test_arms_have_candidates_of_their_own():
     assert (handle.object, cube.object) == ("microwave", "cube")
     ranked = load_candidates("cube", task="DoraMicrowave-v1").position.tolist()
     assert all(position in ranked for position in cube.position.tolist())
-    blind = load_candidates("cube", region=False).position.tolist()
+    blind = load_candidates("cube", region=False, task="DoraMicrowave-v1").position.tolist()
     assert all(position in blind for position in made.candidates(RIGHT, region=False).position.tolist())
     assert made.adapted(cube, RIGHT, right) is cube
     assert made.adapted(handle, LEFT, right) is handle

@@ -12,6 +12,7 @@ from dora.tasks.mdp.stages import StageMachine
 from dora.tasks.microwave import mdp
 from dora.tasks.microwave.mdp import MicrowaveConfig
 from dora.tasks.microwave.snapshot import LEFT, RIGHT
+from dora.tasks.microwave.task import MicrowaveTask
 
 CONFIG = MicrowaveConfig()
 """The task's own numbers."""
@@ -93,6 +94,16 @@ def test_the_cube_is_put_down_when_it_lies_inside_alone(missing: str):
     s = invented(right=right, left=left, cube=cube, door=door)
     assert STAGES[RIGHT][-1].done(s.of(RIGHT)).all() == (missing == "nothing")
     assert TERMS["placed"].value(s).tolist() == [float(missing == "nothing")] * 2
+
+
+def test_grasps_of_a_search_without_regions_count_by_the_open_door_and_the_cube_inside():
+    """Whatever held the door or the cube, and at whichever stage the arms are."""
+    task = MicrowaveTask(CONFIG)
+    for door, x, opened, placed in ((1.2, 0.12, True, True), (1.2, -0.1, True, False), (0.9, 0.12, False, False)):
+        left = {"wrist_p": in_world(-0.3, 0.2, 0.1)}
+        s = invented(right=out(), left=left, cube={"p": in_world(x, 0.0, 0.05)}, door=torch.full((2,), door))
+        assert task.held(s.of(LEFT), LEFT).tolist() == [opened] * 2
+        assert task.held(s.of(RIGHT), RIGHT).tolist() == [placed] * 2
 
 
 def test_an_overlap_above_the_limit_pays_no_end():

@@ -59,20 +59,23 @@ def test_without_an_error_there_is_nothing_to_correct(task):
 
 @pytest.mark.slow
 def test_the_tool_runs_the_same_starts_with_each(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    begun, make = [], oracle.make_task
+    begun, make, guidance = [], oracle.make_task, []
 
     def noted(*args: Any, **options: Any) -> Any:
         task: Any = make(*args, **options)
         reset = task.reset
+        guidance.append(args[2])
         task.reset = lambda seed: (reset(seed=seed), begun.append(task.objects["cube"].pose.p.clone()))
         return task
 
     monkeypatch.setattr(oracle, "make_task", noted)
     monkeypatch.setattr(oracle, "BATCH", 2)
-    monkeypatch.setattr("sys.argv", ["oracle", "DoraCube-v1", "--episodes", "2", "--preset", "hard"])
+    words = ["oracle", "DoraCube-v1", "--episodes", "2", "--preset", "hard", "--guidance", "grasps"]
+    monkeypatch.setattr("sys.argv", words)
     oracle.main()
     out = capsys.readouterr().out
-    assert "DoraCube-v1, hard:" in out
+    assert "DoraCube-v1, hard, guidance grasps:" in out
+    assert guidance == ["grasps"] * 3
     lines = [line for line in out.splitlines() if " none " in f"{line} " or "exact" in line]
     sizes = [float(line.split()[-1]) for line in lines[-3:]]
     assert sizes[:2] == [0.0, 0.0]

@@ -99,8 +99,3 @@ def test_ranking_needs_a_task(tmp_path: Path):
     folder = write_object_folder(load_object("cube"), tmp_path / "block").parent
     with pytest.raises(InputError, match=f"no task uses the object '{folder}'"):
         rank_bundled_set(folder, lambda title: pytest.fail(title))
-
-
-def test_grasps_of_two_arms_are_ranked_by_success_alone():
-    with pytest.raises(InputError, match="DoraMicrowave-v1 has several arms"):
-        rank_bundled_set("microwave", lambda title: pytest.fail(title), region=False)

@@ -45,6 +45,8 @@ class Args:
     """Episodes of each, rounded up to batches of 50."""
     preset: Literal["none", "standard", "hard"] = "standard"
     """How much episodes are randomised."""
+    guidance: Literal["affordance", "grasps"] = "affordance"
+    """Where candidates come from: a search in the regions of the object, or one that knows no region."""
     pose_filter: float | None = None
     """Share of the newest measurement in the estimated pose of an object, 1: no filter; the task's own if not given."""
 
@@ -86,7 +88,7 @@ def outcome(args: Args, act: Act, error: float, report: Callable[[int, int], obj
         InputError: there is no such task.
     """
     changed = {} if args.pose_filter is None else {"pose_filter": args.pose_filter}
-    task = make_task(args.env, BATCH, preset=args.preset, config=changed)
+    task = make_task(args.env, BATCH, args.guidance, preset=args.preset, config=changed)
     task.anneal(error=error)
     success, raw, sizes = [], [], []
     batches = -(-args.episodes // BATCH)
@@ -123,7 +125,7 @@ def main() -> None:
             shares = (share_text(float(x.float().mean()), len(x)) for x in (found.success, found.raw))
             rows.append((name, *shares, f"{found.action:.2f}"))
     about = "" if args.pose_filter is None else f", pose filter {args.pose_filter:g}"
-    print(f"\n{args.env}, {args.preset}{about}:")
+    print(f"\n{args.env}, {args.preset}, guidance {args.guidance}{about}:")
     print(text_table(HEAD, rows))
 
 

@@ -99,9 +99,14 @@ class Task(ABC):
         """
         return load_candidates(self.ARMS[arm].object, region=region)
 
-    def held(self, s: Any) -> Bool[Tensor, " n"]:
+    def held(self, s: Any, arm: str) -> Bool[Tensor, " n"]:
         """The object is in the hand and off the ground, whatever region of it is held: what grasps of a search that
-        knows no region are ranked by. Asked for one arm only."""
+        knows no region are ranked by.
+
+        Args:
+            s: what the arm sees, at the end of an episode of the scripted solution.
+            arm: its name.
+        """
         return opposed(s) & off_table(s, HELD_RISE)
 
     def adapted(self, candidates: GraspCandidates, arm: str, robot: RobotDescription) -> GraspCandidates:

@@ -217,7 +217,7 @@ class HammerTask(Task):
     def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
         return best_candidates("hammer", CLASS, self.config.fewest_catches, self.config.most_candidates, region)
 
-    def held(self, s: HammerSnapshot) -> Bool[Tensor, " n"]:
+    def held(self, s: HammerSnapshot, arm: str) -> Bool[Tensor, " n"]:
         """Two fingers touch the hammer, which has not fallen."""
         return (fingers_on(s) >= 2) & (s.object.p[:, 2] > self.config.fallen)
 

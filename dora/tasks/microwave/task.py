@@ -34,7 +34,7 @@ from dora.tasks.guidance.reference import Reference
 from dora.tasks.guidance.waypoints import WaypointReference
 from dora.tasks.mdp.mdp import Mdp
 from dora.tasks.mdp.snapshot import Snapshot, extended
-from dora.tasks.microwave.mdp import OBSERVATIONS, MicrowaveConfig, failed, paper_terms, stages, terms
+from dora.tasks.microwave.mdp import OBSERVATIONS, MicrowaveConfig, at_rest, failed, paper_terms, stages, terms
 from dora.tasks.microwave.reach import OvenReach, opening_way, oven_reach, placing_way
 from dora.tasks.microwave.reference import opening, placing
 from dora.tasks.microwave.snapshot import CAVITY, LEFT, RIGHT, MicrowaveSnapshot
@@ -99,9 +99,14 @@ class MicrowaveTask(Task):
         judged = stages(c), terms(c), paper_terms(c), c.penetration_limit, OBSERVATIONS, failed
         return Mdp(*judged, "the cube has left the table or the reach of the arm")
 
+    def held(self, s: MicrowaveSnapshot, arm: str) -> Bool[Tensor, " n"]:
+        """What the grasp was for has been done: the door is open, or the cube lies inside, whatever held them."""
+        c: MicrowaveConfig = self.config
+        return s.door >= c.open if arm == LEFT else at_rest(s, c)
+
     def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
         c: MicrowaveConfig = self.config
-        task = "DoraMicrowave-v1" if arm == RIGHT and region else None
+        task = "DoraMicrowave-v1" if arm == RIGHT else None
         return best_candidates(self.ARMS[arm].object, CLASSES[arm], c.fewest, c.most_candidates, region, task)
 
     def adapted(self, candidates: GraspCandidates, arm: str, robot: RobotDescription) -> GraspCandidates:

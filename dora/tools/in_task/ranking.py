@@ -178,10 +178,12 @@ def _executed(task: DoraEnv, seed: int, region: bool) -> dict[str, Bool[Tensor, 
     task.reset(seed=seed)
     success, failed, _ = play_out(task, lambda _: task.scripted_action())
     clean = ~failed & (task.memory.max_penetration <= CLEAN * task.config.penetration_limit)
+    if not region:
+        return {arm: clean & task.task.held(task.snapshot.of(arm), arm) for arm in task.arms}
     if isinstance(task.machine, ParallelStages):
         return {arm: machine.finished & clean for arm, machine in task.machine.machines.items()}
     (arm,) = task.arms
-    return {arm: clean & (success if region else task.task.held(task.snapshot))}
+    return {arm: clean & success}
 
 
 def ranked(candidates: GraspCandidates, ranking: TaskRanking) -> GraspCandidates:
@@ -244,8 +246,7 @@ def rank_bundled_set(
         The files that were written.
 
     Raises:
-        InputError: no such object, no candidates, no task that uses the object, or one of several arms, where only
-            success is known, without `region`.
+        InputError: no such object, no candidates, or no task that uses the object.
     """
     obj = load_object(name)
     ids = tasks_of(obj)
@@ -253,9 +254,6 @@ def rank_bundled_set(
         why = f"no task uses the object {str(name)!r}, so its grasps cannot be ranked in one"
         raise InputError(f"{why}: leave --rank-in-task out.")
     arms = find_task(ids[0]).ARMS
-    if len(arms) > 1 and not region:
-        why = f"{ids[0]} has several arms, where grasps are ranked by success alone"
-        raise InputError(f"{why}: leave --any-region out.")
     objects = {arm: obj if spec.object == obj.name else load_object(spec.object) for arm, spec in arms.items()}
     found = {arm: load_candidates(name if o is obj else o.name, region=region) for arm, o in objects.items()}
     wanted = {
