@@ -55,6 +55,25 @@ def test_grasps_take_away_the_regions_and_nothing_else(env_id: str, config: dict
         task.close()
 
 
+@pytest.mark.slow
+def test_grasps_take_away_the_regions_of_both_arms():
+    whole, grasps = (tasks.make_task("DoraMicrowave-v1", 4, guidance=g) for g in ("affordance", "grasps"))
+    regional = {k for k, e in whole.observation_entries.items() if e.region}
+    assert {name.partition("/")[0] for name in regional} == {"left", "right"}
+    assert set(whole.observation_entries) - set(grasps.observation_entries) == regional
+    assert set(whole.terms.terms) - set(grasps.terms.terms) == {"affordance_left", "affordance_right"}
+    sets = {"left": load_candidates("microwave", region=False)}
+    sets["right"] = load_candidates("cube", region=False, task="DoraMicrowave-v1")
+    grasps.reset(seed=11)
+    for name, arm in grasps.arms.items():
+        used = arm.guide.choice.candidates
+        assert 0 < len(used) <= grasps.config.most_candidates
+        assert torch.equal(used.score.cpu(), sets[name].score[: len(used)])
+        assert used.score.min() >= 0.5 * sets[name].score.max()
+    for task in (whole, grasps):
+        task.close()
+
+
 @pytest.mark.parametrize("env_id", ["DoraCube-v1", "DoraJug-v1"])
 def test_what_the_filter_says_is_its_table(env_id: str):
     """Objects all over the task's area, and beyond it, where the table rejects some candidates and accepts others."""
