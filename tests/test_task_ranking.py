@@ -1,7 +1,9 @@
 """Ranking candidates by executing them in their task, and what of it comes with Dora."""
 
 from dataclasses import replace
+from inspect import unwrap
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,6 +16,7 @@ from dora.affordance.reach.feasibility_table import file_name
 from dora.errors import InputError
 from dora.tasks import make_task
 from dora.tasks.cube import hand_made_candidates
+from dora.tools.in_task import ranking
 from dora.tools.in_task.ranking import (
     TaskRanking,
     _Balanced,
@@ -30,14 +33,14 @@ from dora.tools.in_task.ranking import (
 def test_a_proof_tells_a_good_grasp_from_one_in_the_air():
     good = hand_made_candidates().select([0])
     away = replace(good, position=good.position + torch.tensor([0.0, 0.0, 0.10]))
-    ranking = rank_in_task("DoraCube-v1", concatenate([away, good]), 64, preset="none")
-    assert ranking.tries.sum() <= 64
-    assert (ranking.tries > 10).all()
-    assert ranking.score[1] > 0.8
-    assert ranking.score[0] == 0
-    best_first = ranked(concatenate([away, good]), ranking)
+    found = rank_in_task("DoraCube-v1", concatenate([away, good]), 64, preset="none")
+    assert found.tries.sum() <= 64
+    assert (found.tries > 10).all()
+    assert found.score[1] > 0.8
+    assert found.score[0] == 0
+    best_first = ranked(concatenate([away, good]), found)
     torch.testing.assert_close(best_first.position[0], good.position[0])
-    assert best_first.score.tolist() == sorted(ranking.score.tolist(), reverse=True)
+    assert best_first.score.tolist() == sorted(found.score.tolist(), reverse=True)
 
 
 def test_every_reachable_candidate_is_tried_equally_often_and_no_other():
@@ -99,3 +102,18 @@ def test_ranking_needs_a_task(tmp_path: Path):
     folder = write_object_folder(load_object("cube"), tmp_path / "block").parent
     with pytest.raises(InputError, match=f"no task uses the object '{folder}'"):
         rank_bundled_set(folder, lambda title: pytest.fail(title))
+
+
+def test_without_regions_each_arm_counts_by_what_it_has_done_cleanly(monkeypatch: pytest.MonkeyPatch):
+    """Of three episodes the second has failed, and the third has an overlap above two thirds of the limit."""
+    done = {"left": torch.tensor([True, True, True]), "right": torch.tensor([False, True, True])}
+    failed, success = torch.tensor([False, True, False]), torch.zeros(3, dtype=torch.bool)
+    monkeypatch.setattr(ranking, "play_out", lambda *_: (success, failed, {}))
+    task = SimpleNamespace(
+        reset=lambda seed: None, arms=dict.fromkeys(done), snapshot=SimpleNamespace(of=lambda arm: f"view of {arm}"),
+        memory=SimpleNamespace(max_penetration=torch.tensor([0.0019, 0.0, 0.0021])),
+        config=SimpleNamespace(penetration_limit=0.003),
+        task=SimpleNamespace(held=lambda s, arm: done[arm] if s == f"view of {arm}" else None),
+    )  # fmt: skip
+    counted = unwrap(ranking._executed)(task, 0, region=False)
+    assert {arm: won.tolist() for arm, won in counted.items()} == {"left": [True, False, False], "right": [False] * 3}
