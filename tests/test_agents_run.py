@@ -17,7 +17,15 @@ from fake_task import PointMass
 
 import dora.agents
 from dora.agents.checkpoint import read_checkpoint
-from dora.agents.config import LEARNER_CONFIGS, NEUTRAL, NEUTRAL_LEARNER, UNUSED, config_from_dict, stored_digests
+from dora.agents.config import (
+    LEARNER_CONFIGS,
+    NEUTRAL,
+    NEUTRAL_LEARNER,
+    NOT_USUAL,
+    UNUSED,
+    config_from_dict,
+    stored_digests,
+)
 from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed
 from dora.agents.evaluation.play import load_policy
 from dora.agents.runs.recommended import learners_of, recommended
@@ -145,6 +153,22 @@ def test_policies_from_before_poses_were_filtered_meet_poses_as_measured():
     assert find_task(config.env).CONFIG.BY_PRESET["hard"]["pose_filter"] < 1
 
 
+@pytest.mark.parametrize(
+    ("options", "equal"),
+    [
+        ("", False), ("--guidance grasps", False), ("--guidance none", True),
+        ("--guidance-parts prior reward", True), ("--guidance-parts observation", False),
+    ],
+)  # fmt: skip
+def test_a_candidate_that_nobody_observes_does_not_change_the_digest(options: str, equal: bool):
+    config = run.parse(["--env", "DoraHammer-v1", *options.split()]).run
+    seen, unseen = (dataclasses.replace(config, task=config.task | {"observe_candidate": it}) for it in (True, False))
+    assert (seen.digest() == unseen.digest()) == equal
+    before = dataclasses.replace(config, task={k: v for k, v in config.task.items() if k != "observe_candidate"})
+    assert unseen.digest() == before.digest()
+    assert config_from_dict(plain(before)).task["observe_candidate"] is False
+
+
 def test_an_evaluation_under_another_preset_has_all_numbers_of_it():
     for env_id in ("DoraJug-v1", "DoraMicrowave-v1"):
         path = next(path for path in COMMITTED if path.parents[1].name == env_id and "hard" not in path.parent.name)
@@ -262,7 +286,7 @@ def test_policies_of_versions_without_numbers_mean_the_numbers_of_then(path: Pat
     task = find_task(config.env).CONFIG
     known = json.loads((path.parent / "result.json").read_text()).get("task_config")
     if known is not None:  # a later version, which says its numbers
-        known = {"pose_filter": NEUTRAL["pose_filter"]} | known
+        known = NOT_USUAL | known
         assert task_config(task, config.preset, config.task) == task_config(task, config.preset, known)
         return
     first = yaml.safe_load(FIRST.read_text())

@@ -198,6 +198,30 @@ def test_a_restored_episode_goes_on_with_its_estimate():
     task.close()
 
 
+@pytest.mark.parametrize("env_id", ["DoraJug-v1", "DoraHammer-v1", "DoraMicrowave-v1"])
+def test_the_place_of_a_candidate_on_its_object_has_no_noise_and_stays_the_same_while_it_is_in_force(env_id: str):
+    """Also while the object moves; it is that of the stored candidate, off by at most the preset's error."""
+    task = tasks.make_task(env_id, 4, config={"observe_candidate": True})
+    task.reset(seed=0)
+    entries = {name: e for name, e in task.observation_entries.items() if name.endswith("candidate")}
+    assert len(entries) == len(task.task_scene.arms)
+    first = {name: entry.value(task.observed) for name, entry in entries.items()}
+    error = task.config.randomisation.candidate_position
+    for place, arm in zip(first.values(), task.task_scene.arms.values(), strict=True):
+        choice = arm.guide.choice
+        off = place[:, :3] - choice.candidates.position[choice.buffers.chosen.long()]
+        assert 0.1 * error < off.abs().max() < error + 1e-6
+        assert off.std(0).min() > 0.1 * error  # other episodes have other errors
+    start = {name: pose.p.clone() for name, pose in task.observed.objects.items()}
+    for _ in range(15):
+        task.step(task.scripted_action())
+    for name, pose in task.observed.objects.items():  # it moves, or is measured elsewhere
+        assert (pose.p - start[name]).norm(dim=-1).min() > 1e-4
+    for name, entry in entries.items():
+        torch.testing.assert_close(entry.value(task.observed), first[name], atol=1e-5, rtol=0)
+    task.close()
+
+
 def test_no_action_of_an_episode_takes_effect_in_the_next():
     late = Perturbations(Randomisation(delay=1), 2, 1, {"arm": 20}, 0.05, CPU)
     late.delayed(torch.full((2, 1), 0.7), torch.zeros(2, dtype=torch.long))

@@ -8,6 +8,7 @@ from invented import invented, memory
 from torch import Tensor
 
 from dora.errors import InputError
+from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import PARTS, REGION, exists, guidance_in_force
 from dora.tasks.mdp.mdp import BELOW_TABLE, KNOCKED_AWAY, Mdp, left_table
 from dora.tasks.mdp.memory import EpisodeMemory, HandSizes
@@ -164,17 +165,29 @@ def test_what_belongs_to_a_part_exists_with_it(part: str | None, region: bool, p
 def test_a_table_of_two_arms_has_the_entries_of_each_and_the_shared_ones():
     own = Entry(lambda s: s.time[:, None], "1", "", arm="left")
     guided = Entry(lambda s: s.time[:, None], "1", "", True)
-    table = observation_table(("left", "right"), {"own": own, "guided": guided}, frozenset())
+    table = observation_table(("left", "right"), {"own": own, "guided": guided}, frozenset(), TaskConfig())
     assert "left/own" in table
     assert "right/own" not in table
     assert not [name for name in table if "guided" in name or "goal" in name or "phase" in name]
     assert list(table)[-3:] == ["max_penetration", "stage", "time"]
-    one = observation_table(("left",), {"guided": guided}, frozenset({"observation"}))
+    one = observation_table(("left",), {"guided": guided}, frozenset({"observation"}), TaskConfig())
     assert {"guided", "goal", "time"} <= set(one)
     assert "phase" not in one
-    assert "phase" in observation_table(("left",), {}, frozenset({"prior"}))
+    assert "phase" in observation_table(("left",), {}, frozenset({"prior"}), TaskConfig())
     sizes = {"left/a": 2, "right/b": 1, "c": 3}
     assert columns_by_arm(("left", "right"), sizes) == {"left": [0, 1, 3, 4, 5], "right": [2, 3, 4, 5]}
+
+
+@pytest.mark.parametrize("arms", [("left",), ("left", "right")])
+def test_the_candidate_on_the_object_is_observed_where_it_is_wanted_and_observation_is_guided(arms: tuple[str, ...]):
+    def names(parts: set[str], wanted: bool) -> set[str]:
+        table = observation_table(arms, {}, frozenset(parts), TaskConfig(observe_candidate=wanted))
+        return {name for name in table if "candidate" in name}
+
+    both = {"candidate"} if len(arms) == 1 else {f"{arm}/candidate" for arm in arms}
+    assert names({"observation", "prior"}, True) == both
+    assert not names({"observation", "prior"}, False)
+    assert not names({"reward", "prior"}, True)
 
 
 def test_what_noise_changes_is_computed_anew():

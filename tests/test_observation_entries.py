@@ -17,7 +17,7 @@ from dora.tasks.cube import OBSERVATIONS as CUBE
 from dora.tasks.hammer.observations import OBSERVATIONS as HAMMER
 from dora.tasks.hammer.snapshot import HANDLE_RADIUS, HammerSnapshot
 from dora.tasks.jug import OBSERVATIONS as JUG
-from dora.tasks.mdp.observations import ARM_ENTRIES, FASTEST_SPIN
+from dora.tasks.mdp.observations import ARM_ENTRIES, CANDIDATE_ENTRIES, FASTEST_SPIN
 from dora.tasks.mdp.snapshot import Snapshot, extended
 from dora.tasks.microwave.mdp import OBSERVATIONS as OF_MICROWAVE
 from dora.tasks.microwave.snapshot import LEFT, RIGHT
@@ -94,12 +94,16 @@ EXPECTED: dict[str, Callable[[Snapshot], object]] = {
     ),
     "phase": lambda s: s.goal.phase,
     "residual": lambda s: s.goal.residual,
+    "candidate": lambda s: np.concatenate([
+        rotation(s.object.q).inv().apply((s.goal.p - s.object.p).double().numpy()),
+        columns(rotation(s.object.q).inv() * rotation(s.goal.q)),
+    ], -1),
 }  # fmt: skip
 """Values (n, k) by name of the entry."""
 
 
 def test_every_entry_is_expected():
-    assert list(EXPECTED) == list(ARM_ENTRIES)
+    assert list(EXPECTED) == [*ARM_ENTRIES, *CANDIDATE_ENTRIES]
 
 
 def test_what_a_robot_measures_or_knows_of_itself_stays_beside_pictures():
@@ -111,7 +115,8 @@ def test_what_a_robot_measures_or_knows_of_itself_stays_beside_pictures():
 @pytest.mark.parametrize("name", EXPECTED)
 def test_an_entry_holds_what_it_says(name: str):
     s = state()
-    np.testing.assert_allclose(ARM_ENTRIES[name].value(s), EXPECTED[name](s), rtol=1e-5, atol=1e-5)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    value = {**ARM_ENTRIES, **CANDIDATE_ENTRIES}[name].value(s)
+    np.testing.assert_allclose(value, EXPECTED[name](s), rtol=1e-5, atol=1e-5)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
 # ------------------------------------------------------------------------- of each task

@@ -128,10 +128,17 @@ class SACConfig:
     """Widths of the hidden layers of actor and critics."""
 
 
-NEUTRAL = {"definition": 1, "arm_effort": 1.0, "pose_filter": 1.0, "placed_after_overlap": 0.0, "reorient": "wrist"}
+NEUTRAL = {
+    "definition": 1, "arm_effort": 1.0, "pose_filter": 1.0, "placed_after_overlap": 0.0, "reorient": "wrist",
+    "observe_candidate": False,
+}  # fmt: skip
 """Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
+NOT_USUAL = {name: NEUTRAL[name] for name in ("pose_filter", "observe_candidate")}
+"""Those of them whose usual value is another one, for some task or preset: stored settings without them mean these."""
 WITHOUT_EFFECT = {"turn": ("reorient", "wrist")}
 """The same of numbers that change nothing while another one has such a value."""
+OF_A_PART = {"observe_candidate": "observation"}
+"""The same of numbers that change nothing without this part of guidance."""
 UNUSED = {"reward": "dense", "after_success": None}
 """The same of settings of the run."""
 CONSTANT_PULL = {"prior_last": None, "prior_steps": 100_000}
@@ -222,6 +229,8 @@ def _digested(content: Mapping[str, Any]) -> dict[str, Any]:
     left_out = {"total_steps"} | {name for name, value in UNUSED.items() if content.get(name) == value}
     numbers = content.get("task", {})
     idle = {name for name, (other, value) in WITHOUT_EFFECT.items() if numbers.get(other, value) == value}
+    parts = () if content.get("guidance") == "none" else content.get("guidance_parts")
+    idle |= {name for name, part in OF_A_PART.items() if parts is not None and part not in parts}
     task = {name: value for name, value in numbers.items() if NEUTRAL.get(name) != value and name not in idle}
     neutral, learner = NEUTRAL_LEARNER.get(content.get("agent", ""), {}), content.get("learner", {})
     learner = {name: value for name, value in learner.items() if neutral.get(name) != value}
@@ -262,8 +271,8 @@ def config_from_dict(content: Any, source: str = "the settings") -> RunConfig:
     task = content.get("task", {})
     if not isinstance(task, dict):
         raise InputError(f"{source} have numbers of the task that are no mapping, but {shown(task)}.")
-    if "randomisation" in task:  # all numbers are there, but one that later versions take from the preset
-        task = {"pose_filter": NEUTRAL["pose_filter"]} | task
+    if "randomisation" in task:  # all numbers are there, but those that later versions have
+        task = NOT_USUAL | task
     return dataclasses.replace(read, task=task, learner=learner)
 
 

@@ -112,6 +112,8 @@ class JugConfig(TaskConfig):
     candidate's [1]."""
     most_candidates: int = 12
     """Stored candidates that the task works with [1]."""
+    observe_candidate: bool = True
+    """Whether the policy also observes where on the object the chosen candidate is; with guidance alone."""
     reference: GraspSettings = field(default_factory=lambda: replace(GraspSettings(), hover=0.06))
     """Numbers of the reference; the hand is above the jug at first and would sweep over it, so it hovers."""
     weights: JugWeights = field(default_factory=JugWeights)

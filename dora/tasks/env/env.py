@@ -144,11 +144,11 @@ class DoraEnv(BaseEnv):
         scene = self.task_scene = TaskScene(self.scene, self.num_envs, self.config, scale, task.TABLE)
         for k, name in enumerate(names):
             scene.add(name, task.build(scene, name, self.scale[:, k].cpu().numpy()))
-        self.mdp = task.make_mdp(scene)
-        self.machine: Stages = make_stages(self.mdp.stages, self.num_envs, self.config.dt, self.device)
-        terms = self.mdp.paper_terms if self._reward_mode == "paper" else self.mdp.terms
+        mdp = self.mdp = task.make_mdp(scene)
+        self.machine: Stages = make_stages(mdp.stages, self.num_envs, self.config.dt, self.device)
+        terms = mdp.paper_terms if self._reward_mode == "paper" else mdp.terms
         self.terms: Terms[Any] = terms.in_force(self.parts)
-        self.observation_entries = observation_table(tuple(task.ARMS), self.mdp.observations, self.parts)
+        self.observation_entries = observation_table(tuple(task.ARMS), mdp.observations, self.parts, self.config)
         scene.make_arms(task, getattr(self.agent, "agents", [self.agent]), self.parts, self._grasps, self._tables)
         self.anneal(**self._shares)
         scene.make_reader(task)

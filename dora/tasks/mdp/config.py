@@ -48,6 +48,8 @@ class TaskConfig:
     """Share of their torque limits with which the drives of an arm work; control modes of joints ignore it [1]."""
     pose_filter: float = 1.0
     """Share of the newest measurement in the estimated pose of an object, for policy and reference; 1: no filter."""
+    observe_candidate: bool = False
+    """Whether the policy also observes where on the object the chosen candidate is; with guidance alone."""
     residual: ResidualBounds = field(default_factory=ResidualBounds)
     """Bounds of the residual action."""
     randomisation: Randomisation = field(default_factory=Randomisation)

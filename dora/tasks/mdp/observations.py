@@ -13,6 +13,7 @@ from dora.geometry.rotations import (
     quaternion_inverse,
     quaternion_multiply,
 )
+from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import OBSERVATION, PRIOR, exists
 from dora.tasks.mdp.quantities import goal_error, in_wrist, lifted, nearest_errors, turned_in_wrist
 from dora.tasks.mdp.snapshot import Snapshot
@@ -53,15 +54,18 @@ class Entry:
         return exists(part, self.region, parts)
 
 
-def observation_table(arms: Sequence[str], extra: Mapping[str, Entry], parts: frozenset[str]) -> dict[str, Entry]:
+def observation_table(
+    arms: Sequence[str], extra: Mapping[str, Entry], parts: frozenset[str], config: TaskConfig
+) -> dict[str, Entry]:
     """The entries of a task's observation, in order.
 
     Args:
         arms: names of the arms. With several, each arm has all entries, under `<arm>/<name>`, of what it sees.
         extra: the task's own entries beyond `ARM_ENTRIES` and `SHARED_ENTRIES`, of one arm.
         parts: parts of guidance in force; entries of other parts are left out.
+        config: numbers of the task; with `observe_candidate` there are `CANDIDATE_ENTRIES` besides.
     """
-    table = {**ARM_ENTRIES, **extra}
+    table = {**ARM_ENTRIES, **extra, **(CANDIDATE_ENTRIES if config.observe_candidate else {})}
     if len(arms) > 1:
         own = {
             f"{arm}/{name}": replace(entry, value=_as_observed_by(arm, entry))
@@ -138,6 +142,13 @@ def _object_turn(s: Snapshot) -> Tensor:
     return _axes(quaternion_multiply(quaternion_inverse(s.hand.wrist_q), s.object.q))
 
 
+def _candidate(s: Snapshot) -> Tensor:
+    """(n, 9): position [m] and two axes of the chosen candidate's wrist in the object's frame."""
+    back = quaternion_inverse(s.object.q)
+    place = quaternion_apply(back, s.goal.p - s.object.p)
+    return torch.cat([place, _axes(quaternion_multiply(back, s.goal.q))], -1)
+
+
 ARM_ENTRIES: dict[str, Entry] = {
     "hand_q": Entry(lambda s: s.hand.q, "rad", "hand joint angles, thumb to pinky", sensed=True),
     "hand_v": Entry(lambda s: s.hand.v, "rad/s", "hand joint velocities", sensed=True),
@@ -180,5 +191,10 @@ ARM_ENTRIES: dict[str, Entry] = {
     ),
 }
 """What every arm of every task observes."""
+CANDIDATE_ENTRIES = {
+    "candidate": Entry(_candidate, "m, 1", "candidate's wrist in the object's frame, position and two axes", True)
+}
+"""What every arm observes besides with the task's number `observe_candidate`. It is the same in the whole episode, and
+free of noise: the pose of the object and the goal that follows from it are measured with the same error."""
 SHARED_ENTRIES = ("max_penetration", "stage", "time")
 """Those of them that are the same for all arms of a task."""
