@@ -144,11 +144,11 @@ class JugTask(Task):
     CONTACT_POINTS = 32
     LEARNERS: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "sac": {
-            "total_steps": 300_000, "stop_success": 0.98, "num_envs": 32, "eval_every": 50_000, "eval_episodes": 100,
+            "total_steps": 300_000, "stop_success": 0.99, "num_envs": 32, "eval_every": 50_000, "eval_episodes": 100,
             "eval_envs": 50, "presets": {"hard": {"learner": {"prior": 0.01, "noise_correlation": 0.9}}},
         },
         "ppo": {
-            "total_steps": 600_000, "stop_success": 0.98, "num_envs": 64, "eval_every": 60_000, "eval_episodes": 100,
+            "total_steps": 600_000, "stop_success": 0.99, "num_envs": 64, "eval_every": 60_000, "eval_episodes": 100,
             "eval_envs": 50, "learner": {"rollout": 16, "log_std": -1.8},
         },
     }  # fmt: skip
