@@ -22,10 +22,10 @@ from dora.errors import InputError
 from dora.robot import load_robot
 from dora.robot.urdf import UrdfModel, read_urdf
 from dora.sim import robots
-from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot
+from dora.sim.robot_agent import CONTROL_MODES, COUPLED, FINGERS, DescribedRobot
 from dora.sim.robots import Diana7Hit, class_name, register_robot
 
-MODES = [mode + end for end in ("", COUPLED) for mode in CONTROL_MODES]
+MODES = [*(mode + end for end in ("", COUPLED) for mode in CONTROL_MODES), CONTROL_MODES[0] + FINGERS]
 BACKENDS = {"physx_cpu": 1, "physx_cpu_batch": 3}
 """Number of environments on each back end."""
 
@@ -90,7 +90,7 @@ for backend, num_envs in (("physx_cpu", 1), ("physx_cpu_batch", 4)):
 def test_after_import_dora_alone_the_robot_steps_in_every_control_mode():
     result = run(STEPS.format(modes=MODES))
     assert result.returncode == 0, result.stderr
-    assert result.stdout.count("stepped") == 2 * len(MODES) == 12
+    assert result.stdout.count("stepped") == 2 * len(MODES) == 14
 
 
 def test_every_folder_has_one_registered_class():

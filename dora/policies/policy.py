@@ -18,7 +18,7 @@ from dora.agents.evaluation.play import load_policy as networks_of
 from dora.configs import plain
 from dora.errors import InputError, shown
 from dora.policies.card import Card
-from dora.sim.robot_agent import CONTROL_MODES
+from dora.sim.robot_agent import CONTROL_MODES, FINGERS
 from dora.tasks import check_task_id, find_task, options_under_preset, task_ids
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.env.options import task_config
@@ -120,12 +120,13 @@ class TaskPolicy:
     def _traits(self) -> dict[str, Any]:
         """`traits` of the environment that it was trained in."""
         config, cls = self.config, find_task(self.env_id).CONFIG
+        numbers = task_config(cls, config.preset, config.task)
         return {
             "guidance": _words(guidance_in_force(config.guidance, config.guidance_parts)),
-            "control mode": CONTROL_MODES[0],
+            "control mode": CONTROL_MODES[0] + (FINGERS if numbers.hand_action == "fingers" else ""),
             "observation size": self.observation_size,
             "action size": self.action_size,
-            **_meaning(plain(task_config(cls, config.preset, config.task))),
+            **_meaning(plain(numbers)),
         }
 
     def _checked(self, obs: Any) -> Tensor:

@@ -3,6 +3,7 @@
 One law on every backend, in batched torch, on *commanded* joints: contact forces never leak into the command.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ from dora.geometry.poses import Pose, compose
 from dora.geometry.rotations import quaternion_apply, quaternion_from_matrix, quaternion_inverse
 from dora.robot.description import RobotDescription
 from dora.robot.kinematics import Frames, SerialChain
+from dora.robot.synergies import expand_fingers, reduce_fingers, synergy_count
 
 WRIST_SPEED = 0.6
 """Linear wrist speed of a full action along one axis [m/s], unless a task sets its own."""
@@ -31,6 +33,28 @@ AT_ORIGIN = 1e-6
 """Largest difference of a base's pose from the world's that is rounding of the simulator [m], [1]."""
 LIMIT_MARGIN = 0.01
 """Distance that commanded arm joints keep from their limits [rad]."""
+
+
+@dataclass(frozen=True)
+class HandCommand:
+    """How a hand is commanded: number of components, and the maps from them to all joints and back.
+
+    Both are in units of half a joint's range about its middle.
+    """
+
+    size: Callable[[RobotDescription], int]
+    expand: Callable[[RobotDescription, Tensor], Tensor]
+    reduce: Callable[[RobotDescription, Tensor], Tensor]
+
+
+HAND_COMMANDS = {
+    "joints": HandCommand(lambda robot: len(robot.hand), lambda _, hand: hand, lambda _, hand: hand),
+    "coupled": HandCommand(
+        lambda robot: len(robot.hand_actuated), RobotDescription.expand_hand, RobotDescription.reduce_hand
+    ),
+    "fingers": HandCommand(synergy_count, expand_fingers, reduce_fingers),
+}
+"""By name: every joint, the actuated joints with their followers, and the bend of each finger."""
 
 
 class WristHandController(BaseController):
@@ -97,8 +121,8 @@ class WristHandController(BaseController):
 
     @property
     def hand_size(self) -> int:
-        """Number of hand components in the action: all joints, or the actuated ones if coupled."""
-        return len(self.config.robot.hand_actuated if self.config.coupled else self.config.robot.hand)
+        """Number of hand components in the action."""
+        return HAND_COMMANDS[self.config.hand].size(self.config.robot)
 
     def set_drive_property(self) -> None:
         """Gains, effort limits and armature from the robot's description."""
@@ -136,8 +160,8 @@ class WristHandController(BaseController):
         self._begun, self._starting = False, None
 
     def expand_hand(self, hand: Float[Tensor, "n h"]) -> Float[Tensor, "n hand"]:
-        """Values of the action's hand components -> values of all hand joints, followers equal to leaders."""
-        return self.config.robot.expand_hand(hand) if self.config.coupled else hand
+        """Values of the action's hand components -> values of all hand joints."""
+        return HAND_COMMANDS[self.config.hand].expand(self.config.robot, hand)
 
     def wrist(self) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
         """The commanded wrist pose in the robot's base frame."""
@@ -185,8 +209,7 @@ class WristHandController(BaseController):
     def hand_action(self, joints: Float[Tensor, "n hand"]) -> Float[Tensor, "n h"]:
         """Hand components of the action that ask for these joint targets [rad]."""
         middle, half = (self.hand_upper + self.hand_lower) / 2, (self.hand_upper - self.hand_lower) / 2
-        action = ((joints - middle) / half).clamp(-1, 1)
-        return self.config.robot.reduce_hand(action) if self.config.coupled else action
+        return HAND_COMMANDS[self.config.hand].reduce(self.config.robot, ((joints - middle) / half).clamp(-1, 1))
 
     def set_action(self, action: Float[Tensor, "n a"]) -> None:
         """Moves the commanded joints by one control step and sends them to the drives."""
@@ -239,10 +262,10 @@ class WristHandController(BaseController):
 
 @dataclass
 class WristHandConfig(ControllerConfig):
-    """Configuration of `WristHandController`; `coupled` enforces the hand's couplings in the command."""
+    """Configuration of `WristHandController`; `hand` is one of `HAND_COMMANDS`."""
 
     robot: RobotDescription
-    coupled: bool = False
+    hand: str = "joints"
     controller_cls = WristHandController
 
 

@@ -24,6 +24,8 @@ CONTROL_MODES = ("wrist_delta_hand_pos", "pd_joint_pos", "pd_joint_delta_pos")
 """Control modes of every robot, the default first; each exists with the suffix COUPLED as well."""
 COUPLED = "_coupled"
 """Suffix of the control modes that enforce the hand's couplings."""
+FINGERS = "_fingers"
+"""Suffix of the control mode that commands the bend of each finger; the default mode alone has it."""
 JOINT_DELTA = 0.1
 """Full action of `pd_joint_delta_pos` [rad per control step]."""
 
@@ -221,7 +223,8 @@ class DescribedRobot(BaseAgent):
             wrist: WristHandConfig(names, robot=d),
             absolute_mode: PDJointPosControllerConfig(names, **absolute),
             delta_mode: PDJointPosControllerConfig(names, **delta),
-            wrist + COUPLED: WristHandConfig(names, robot=d, coupled=True),
+            wrist + COUPLED: WristHandConfig(names, robot=d, hand="coupled"),
             absolute_mode + COUPLED: CoupledJointPosConfig(names, robot=d, **absolute),
             delta_mode + COUPLED: CoupledJointPosConfig(names, robot=d, **delta),
+            wrist + FINGERS: WristHandConfig(names, robot=d, hand="fingers"),
         }

@@ -30,6 +30,7 @@ IN_WORDS = {
     ("optimised", "False"): "grasp made by hand",
     ("optimised", "True"): "grasps of the search",
     ("reorient", "in_hand"): "turned in the hand",
+    ("hand_action", "fingers"): "one number a finger",
 }
 """Values of numbers of tasks, by name and value, as readers of a table know them."""
 WITHOUT_OVERLAP = {"after_overlap": "1.0", "placed_after_overlap": "1.0", "weights.penetration": "0.0"}

@@ -15,10 +15,10 @@ from dora.robot import available_robots
 from dora.sim.batch.hooks import BACKEND, MOST_ENVS, check_room
 from dora.sim.batch.rendering import can_render, refuse_pictures, wants_pictures
 from dora.sim.keywords import on_gpu
-from dora.sim.robot_agent import CONTROL_MODES, COUPLED, DescribedRobot
+from dora.sim.robot_agent import CONTROL_MODES, COUPLED, FINGERS, DescribedRobot
 from dora.sim.robots import register_robot
 from dora.tasks.mdp.config import TaskConfig
-from dora.tasks.mdp.guidance_parts import guidance_in_force
+from dora.tasks.mdp.guidance_parts import PRIOR, guidance_in_force
 from dora.tasks.mdp.randomisation import find_preset
 
 RATES = {
@@ -146,9 +146,21 @@ def check_options(
     mode = control_mode or CONTROL_MODES[0]
     if hand_joints == 15 and not mode.endswith(COUPLED):
         mode += COUPLED
-    known = [m + end for m in CONTROL_MODES for end in ("", COUPLED)]
+    by_finger = CONTROL_MODES[0] + FINGERS
+    known = [m + end for m in CONTROL_MODES for end in ("", COUPLED)] + [by_finger]
     if mode not in known:
         raise InputError(f"unknown control mode {control_mode!r}; choose one of {', '.join(known)}")
+    if config.hand_action == "fingers" or mode == by_finger:
+        if mode not in (CONTROL_MODES[0], by_finger):
+            raise InputError(
+                f'config.hand_action="fingers" is for {CONTROL_MODES[0]!r}, not {mode!r}: leave one of them out.'
+            )
+        if PRIOR in parts:
+            raise InputError(
+                "a number for each finger is too coarse for the residual action on a reference: use "
+                'hand_action="joints", or guidance="none", or guidance_parts without "prior".'
+            )
+        mode, config = by_finger, replace(config, hand_action="fingers")
     if sim_backend == "auto":
         sim_backend = BACKEND if num_envs > 1 else "physx_cpu"
     if on_gpu(sim_backend):

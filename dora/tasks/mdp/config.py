@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
@@ -48,6 +48,8 @@ class TaskConfig:
     """Share of their torque limits with which the drives of an arm work; control modes of joints ignore it [1]."""
     pose_filter: float = 1.0
     """Share of the newest measurement in the estimated pose of an object, for policy and reference; 1: no filter."""
+    hand_action: Literal["joints", "fingers"] = "joints"
+    """What commands a hand: a number for each joint, or one for the bend of each finger and one for the thumb aside."""
     observe_candidate: bool = False
     """Whether the policy also observes where on the object the chosen candidate is; with guidance alone."""
     residual: ResidualBounds = field(default_factory=ResidualBounds)
