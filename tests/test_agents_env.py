@@ -5,11 +5,12 @@ from typing import Any
 import pytest
 import torch
 from fake_task import PointMass
+from refusals import refused
 from tensordict import TensorDict
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
-from dora.agents.collecting.task_env import EpisodeColumns, EpisodeEnds, TaskEnv, ended_episodes
+from dora.agents.collecting.task_env import Easing, EpisodeColumns, TaskEnv, TrainingRules, ended_episodes
 from dora.agents.seeds import TRAINING_SEEDS
 
 
@@ -25,7 +26,7 @@ def test_specs_hold():
 
 
 def test_the_true_last_observation_is_kept_and_only_ended_rows_restart():
-    env = TaskEnv(PointMass(4, max_steps=5), seed=0, ends=EpisodeEnds(stagger=True))
+    env = TaskEnv(PointMass(4, max_steps=5), seed=0, rules=TrainingRules(stagger=True))
     data = rollout(env, 12)
     done = data["next", "done"][..., 0]
     moved = (data["next", "observation"][..., :2] - data["observation"][..., :2]).abs()
@@ -39,7 +40,7 @@ def test_the_true_last_observation_is_kept_and_only_ended_rows_restart():
 
 def test_the_short_path_equals_torchrl_own():
     ours, theirs = (
-        TaskEnv(PointMass(4, max_steps=5, fail_at=4), seed=1, ends=EpisodeEnds(stagger=True)) for _ in range(2)
+        TaskEnv(PointMass(4, max_steps=5, fail_at=4), seed=1, rules=TrainingRules(stagger=True)) for _ in range(2)
     )
     state, reference = ours.reset(), theirs.reset()
     for _ in range(15):
@@ -80,7 +81,7 @@ def test_statistics_are_those_of_the_episode():
 
 
 def test_staggered_first_episodes_are_spread_and_not_counted():
-    env = TaskEnv(PointMass(64, max_steps=16), seed=3, ends=EpisodeEnds(stagger=True))
+    env = TaskEnv(PointMass(64, max_steps=16), seed=3, rules=TrainingRules(stagger=True))
     data = rollout(env, 48)
     first = data["next", "done"][..., 0].float().argmax(1)
     assert len(first.unique()) > 8
@@ -92,7 +93,7 @@ def test_staggered_first_episodes_are_spread_and_not_counted():
 @pytest.mark.parametrize("after", [0, 2, 9])
 def test_an_episode_ends_some_steps_after_its_first_success(after: int):
     task = PointMass(64, max_steps=12)
-    data = rollout(TaskEnv(task, seed=0, ends=EpisodeEnds(after_success=after)), 120)
+    data = rollout(TaskEnv(task, seed=0, rules=TrainingRules(after_success=after)), 120)
     columns = TaskEnv(task).columns
     success = columns.column(data["next", "statistics"], "success") > 0
     done, terminated = data["next", "done"][..., 0], data["next", "terminated"]
@@ -142,3 +143,43 @@ def test_the_rows_of_a_training_have_seeds_that_no_evaluation_has():
     assert first == again
     assert len(set(first)) == 64
     assert all(0 <= seed < TRAINING_SEEDS for seed in first)
+
+
+class Pressing(PointMass):
+    """Points that pay half a unit for overlap in every step."""
+
+    logged = (*PointMass.logged, "reward/penetration")
+
+    def step(self, action: Any) -> Any:
+        obs, reward, *ends, info = super().step(action)
+        cost = torch.full_like(reward, -0.5)
+        return obs, reward + cost, *ends, info | {"reward/penetration": cost}
+
+
+@pytest.mark.parametrize(("begun", "workers"), [(0, 1), (200, 2)])
+def test_overlap_costs_more_and_more_in_the_course_of_a_training(begun: int, workers: int):
+    """From a hundredth at the first step of the run to all of it after 800, wherever this part of it begins."""
+    easing = Easing(0.01, 800, begun, workers)
+    eased, whole = (
+        TaskEnv(Pressing(8), seed=0, rules=rules) for rules in (TrainingRules(easing=easing), TrainingRules())
+    )
+    action = torch.zeros(8, 2)
+    paid = []
+    for env in (eased, whole):
+        state, rewards = env.reset(), []
+        for _ in range(120):
+            step, state = env.step_and_maybe_reset(state.set("action", action))
+            rewards.append(step["next", "reward"][:, 0])
+        paid.append(torch.stack(rewards))
+    share = 1 - (paid[0] - paid[1]) / 0.5
+    done = begun + workers * 8 * torch.arange(120.0)
+    expected = 0.01 ** (1 - done / 800).clamp(min=0)
+    torch.testing.assert_close(share, expected[:, None].expand(120, 8), atol=1e-5, rtol=0)
+    assert share[0, 0] == pytest.approx(0.01 ** (1 - begun / 800), abs=1e-5)
+    assert share[-1].min() == 1.0
+
+
+def test_a_penalty_that_a_reward_lacks_cannot_be_eased():
+    with refused("this reward has none"):
+        TaskEnv(PointMass(2), rules=TrainingRules(easing=Easing(0.5, 10)))
+    TaskEnv(PointMass(2), rules=TrainingRules(easing=Easing(1.0, 10)))

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from dora.agents.checkpoint import read_checkpoint
 from dora.agents.collecting.rollouts import Rollouts
-from dora.agents.collecting.task_env import EpisodeEnds
+from dora.agents.collecting.task_env import TrainingRules
 from dora.agents.config import SACConfig
 from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.evaluation.play import evaluate_checkpoint
@@ -216,7 +216,7 @@ def test_batches_collected_ahead_are_of_the_policy_before():
     actor: Any = learner.actor
     rollouts = Rollouts(
         functools.partial(Slow, 4), learner.policy,
-        workers=2, num_envs=4, rollout=8, seeds=[0, 1], ends=EpisodeEnds(), ahead=True,
+        workers=2, num_envs=4, rollout=8, seeds=[0, 1], rules=TrainingRules(), ahead=True,
     )  # fmt: skip
     means: list[float] = []
     with rollouts, torch.no_grad():
@@ -232,7 +232,7 @@ def test_the_message_of_a_failing_worker_arrives(ahead: bool):
     learner = PPO(SMALL_PPO, 4, 2, 1000)
     rollouts = Rollouts(
         functools.partial(Drifting, 4), learner.policy,
-        workers=1, num_envs=4, rollout=8, seeds=[0], ends=EpisodeEnds(), ahead=ahead,
+        workers=1, num_envs=4, rollout=8, seeds=[0], rules=TrainingRules(), ahead=ahead,
     )  # fmt: skip
     with rollouts, pytest.raises(InputError, match="environment 3 is NaN"):
         rollouts.collect()

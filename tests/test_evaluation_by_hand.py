@@ -14,7 +14,7 @@ from test_run_by_hand import COLUMNS, evaluation_of
 from torch import Tensor
 
 from dora.agents.collecting.rollouts import Rollouts
-from dora.agents.collecting.task_env import EpisodeColumns, EpisodeEnds, TaskEnv, ended_episodes
+from dora.agents.collecting.task_env import EpisodeColumns, TaskEnv, TrainingRules, ended_episodes
 from dora.agents.config import PPOConfig, RunConfig
 from dora.agents.evaluation.evaluate import (
     FINAL_SEED,
@@ -182,11 +182,11 @@ class Told(PointMass):
         return observation, torch.tensor(given.get("reward", [1.0, 2.0])), fail, truncated, info
 
 
-def steps_of(answers: list[dict[str, list[float]]], **ends: Any) -> tuple[TaskEnv, list[TensorDict]]:
+def steps_of(answers: list[dict[str, list[float]]], **rules: Any) -> tuple[TaskEnv, list[TensorDict]]:
     """The environment and what it says after each step of two rows."""
     task = Told(2, max_steps=4)
     task.answers = answers
-    env = TaskEnv(task, seed=1, ends=EpisodeEnds(**ends))
+    env = TaskEnv(task, seed=1, rules=TrainingRules(**rules))
     env.reset()
     data = TensorDict({"action": torch.zeros(2, 2)}, [2])
     return env, [env._step(data) for _ in answers]
@@ -227,7 +227,7 @@ def test_a_row_that_is_not_finite_fails_earns_nothing_and_is_no_success(wrong: d
 
 def test_first_episodes_that_are_staggered_last_from_one_step_to_the_most():
     task = PointMass(400, max_steps=4)
-    env = TaskEnv(task, seed=2, ends=EpisodeEnds(stagger=True))
+    env = TaskEnv(task, seed=2, rules=TrainingRules(stagger=True))
     env.reset()
     data = TensorDict({"action": torch.zeros(400, 2)}, [400])
     said = [env._step(data) for _ in range(4)]
@@ -241,7 +241,7 @@ def test_first_episodes_that_are_staggered_last_from_one_step_to_the_most():
 
 
 def test_the_second_episode_of_a_row_is_a_whole_one_and_begins_with_empty_statistics():
-    env = TaskEnv(PointMass(3, max_steps=4), seed=0, ends=EpisodeEnds(stagger=True))
+    env = TaskEnv(PointMass(3, max_steps=4), seed=0, rules=TrainingRules(stagger=True))
     state: Any = env.reset()
     lengths: list[list[float]] = [[], [], []]
     for _ in range(14):
@@ -285,9 +285,9 @@ def test_a_task_is_closed_with_its_environment_and_with_those_that_evaluate():
     assert [task.closed for task in made[1:]] == [False, False]
     evaluators.close()
     assert [task.closed for task in made[1:]] == [True, True]
-    ends = EpisodeEnds()
+    rules = TrainingRules()
     policy = make_learner(config, 4, 2).policy
-    with Rollouts(lambda: make(4), policy, workers=0, num_envs=4, rollout=2, seeds=[1], ends=ends) as rollouts:
+    with Rollouts(lambda: make(4), policy, workers=0, num_envs=4, rollout=2, seeds=[1], rules=rules) as rollouts:
         rollouts.collect()
         assert not made[-1].closed
     assert made[-1].closed

@@ -8,7 +8,7 @@ SCRIPT = """
 import functools
 from fake_task import PointMass
 from dora.agents.collecting.rollouts import Rollouts
-from dora.agents.collecting.task_env import EpisodeEnds, TaskEnv
+from dora.agents.collecting.task_env import TrainingRules, TaskEnv
 from dora.agents.learners.networks import Normaliser, Policy, TanhActor
 
 class Stuck:
@@ -23,7 +23,7 @@ if __name__ == "__main__":
     actor.register_forward_hook(Stuck())
     make = functools.partial(PointMass, 2)
     policy = Policy(Normaliser(observation, 9), actor)
-    Rollouts(make, policy, workers=2, num_envs=2, rollout=4, seeds=[1, 2], ends=EpisodeEnds())
+    Rollouts(make, policy, workers=2, num_envs=2, rollout=4, seeds=[1, 2], rules=TrainingRules())
 """
 
 

@@ -13,7 +13,7 @@ from fake_task import PointMass
 from torch import Tensor
 
 from dora.agents.collecting.rollouts import Rollouts
-from dora.agents.collecting.task_env import EpisodeEnds
+from dora.agents.collecting.task_env import TrainingRules
 from dora.agents.config import PPOConfig
 from dora.agents.learners.networks import Policy, last_layer
 from dora.agents.learners.ppo import PPO
@@ -57,7 +57,7 @@ def cluster() -> Iterator[None]:
 def rollouts(policy: Policy, make: Any = PointMass, workers: int = 2, **options: Any) -> Rollouts:
     return Rollouts(
         functools.partial(make, 4), policy, workers=workers, num_envs=4, rollout=8, seeds=list(range(workers)),
-        ends=EpisodeEnds(), **options,
+        rules=TrainingRules(), **options,
     )  # fmt: skip
 
 

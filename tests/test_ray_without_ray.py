@@ -12,7 +12,7 @@ from fake_task import PointMass
 from tensordict import TensorDict
 
 from dora.agents.collecting.ray_collector import FOREVER, ActorCollector, explained, ray_collector, whole_batch
-from dora.agents.collecting.task_env import EpisodeEnds, TaskEnv
+from dora.agents.collecting.task_env import TaskEnv, TrainingRules
 from dora.agents.config import PPOConfig
 from dora.agents.learners.ppo import PPO
 from dora.errors import InputError, WorkerFailure
@@ -48,8 +48,8 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Cluster:
 
 def collector(seeds: list[int], make: Any = PointMass) -> Any:
     policy = PPO(PPOConfig(hidden=(8,)), 4, 2, 1000).policy
-    ends = EpisodeEnds(stagger=True, after_success=3)
-    return ray_collector(make, policy, frames=64, seeds=seeds, ends=ends), policy
+    rules = TrainingRules(stagger=True, after_success=3)
+    return ray_collector(make, policy, frames=64, seeds=seeds, rules=rules), policy
 
 
 def test_each_worker_is_an_actor_with_a_core_and_a_seed_of_its_own(cluster: Cluster, monkeypatch: pytest.MonkeyPatch):
@@ -72,7 +72,7 @@ def test_each_worker_is_an_actor_with_a_core_and_a_seed_of_its_own(cluster: Clus
             assert os.environ["OMP_NUM_THREADS"] == "1"
             assert torch.initial_seed() == seed
             assert isinstance(env, TaskEnv)
-            assert env.ends == EpisodeEnds(stagger=True, after_success=3)
+            assert env.rules == TrainingRules(stagger=True, after_success=3)
             alone = TaskEnv(PointMass(16), seed=seed)
             assert torch.equal(env.reset()["observation"], alone.reset()["observation"])
     finally:

@@ -154,12 +154,15 @@ def test_success_has_the_interval_of_all_episodes_and_zero_correction_that_of_ea
 
 def test_runs_of_another_reward_and_policies_evaluated_again_have_rows_of_their_own(tmp_path: Path):
     write_run(tmp_path / "a", 0, 0.9)
-    for name, more in (("b", {"reward": "paper"}), ("c", {"checkpoint": "best.safetensors"})):
+    for name, key, value in (
+        ("b", "reward", "paper"), ("c", "checkpoint", "best.safetensors"), ("d", "overlap_share", 0.1),
+    ):  # fmt: skip
         write_run(tmp_path / name, 0, 0.9)
         path = tmp_path / name / "result.json"
-        path.write_text(json.dumps(json.loads(path.read_text()) | more))
-    agents = [row.split(" | ")[2] for row in tables(find_runs(tmp_path)).splitlines()[2:]]
-    assert agents == ["PPO", "PPO, evaluated again", "PPO, paper's reward"]
+        path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    rows = [row.split(" | ") for row in tables(find_runs(tmp_path)).splitlines()[2:]]
+    assert [row[2] for row in rows] == ["PPO", "PPO", "PPO, evaluated again", "PPO, paper's reward"]
+    assert [row[3] for row in rows] == ["affordance", "affordance, overlap eased", "affordance", "affordance"]
 
 
 def test_training_is_drawn_where_runs_have_a_table_of_it(tmp_path: Path):

@@ -92,6 +92,10 @@ def test_overlap_costs_from_what_is_free_to_a_limit_beyond_it():
         "effort": weights.effort, "change": weights.change, "penetration": weights.penetration,
     }  # fmt: skip
     assert made["penetration"].doc == "overlap beyond 0.5 mm"
+    deeper = terms.penalties(weights, 0.001, 0.005, 4.0)["penetration"]
+    assert deeper.weight == 4 * weights.penetration
+    depth = torch.tensor([0.0, 0.006, 0.011, 0.021, 0.1])
+    assert deeper.value(invented(5, penetration=depth)).tolist() == close(0.0, 0.25, 0.5, 1.0, 1.0)
 
 
 def test_printed_terms_of_grasping_and_lifting():

@@ -130,7 +130,7 @@ class SACConfig:
 
 NEUTRAL = {
     "definition": 1, "arm_effort": 1.0, "pose_filter": 1.0, "placed_after_overlap": 0.0, "reorient": "wrist",
-    "observe_candidate": False, "hand_action": "joints",
+    "observe_candidate": False, "hand_action": "joints", "overlap_range": 1.0,
 }  # fmt: skip
 """Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
 NOT_USUAL = {name: NEUTRAL[name] for name in ("pose_filter", "observe_candidate")}
@@ -139,7 +139,7 @@ WITHOUT_EFFECT = {"turn": ("reorient", "wrist")}
 """The same of numbers that change nothing while another one has such a value."""
 OF_A_PART = {"observe_candidate": "observation"}
 """The same of numbers that change nothing without this part of guidance."""
-UNUSED = {"reward": "dense", "after_success": None}
+UNUSED = {"reward": "dense", "after_success": None, "overlap_share": 1.0, "overlap_steps": 600_000}
 """The same of settings of the run."""
 CONSTANT_PULL = {"prior_last": None, "prior_steps": 100_000}
 """Settings of a pull that does not change."""
@@ -199,6 +199,10 @@ class RunConfig(Generic[Numbers, Settings, Agent]):
     after_success: int | None = None
     """Control steps after its first success at which an episode of the training is truncated, so that the budget goes
     into what has not been learned; None: it goes on to its limit. Evaluations always do."""
+    overlap_share: float = 1.0
+    """Share of the penalty for overlap that counts at the first step of the training; it grows geometrically to 1."""
+    overlap_steps: int = 600_000
+    """Environment steps after which all of it counts."""
     task: Numbers = field(default_factory=dict)  # pyright: ignore[reportAssignmentType]
     """Numbers of the task, all of them: weights, thresholds, randomisation, rates."""
     learner: Settings = field(default_factory=PPOConfig)  # pyright: ignore[reportAssignmentType]

@@ -18,7 +18,7 @@ COPIES, COPIES_OF_SAC = 6, 12
 besides their targets and a second copy of the actor [1]."""
 BYTES = 4
 """Size of such a number [bytes]."""
-RUN = {
+RUN: dict[str, tuple[float, float]] = {
     "seed": (0, LARGEST_SEED),
     "total_steps": (1, 10**12),
     "num_envs": (1, 100_000),
@@ -30,6 +30,8 @@ RUN = {
     "eval_envs": (1, 100_000),
     "stop_success": (0, 1),
     "after_success": (0, 10**12),
+    "overlap_share": (1e-6, 1),
+    "overlap_steps": (1, 10**12),
     "checkpoint_seconds": (0, 10**9),
     "normaliser_samples": (0, 10**12),
 }

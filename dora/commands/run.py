@@ -52,7 +52,7 @@ ENTRANCES = ("--env", "--eval-only", "--checkpoint", "--resume")
 """Options that say what is run."""
 OF_TRAINING = (
     "env", "agent", "learner", "total_steps", "eval_every", "eval_episodes", "stop_success", "checkpoint_seconds",
-    "normaliser_samples", "stagger", "after_success", "num_envs", "learner_threads",
+    "normaliser_samples", "stagger", "after_success", "overlap_share", "overlap_steps", "num_envs", "learner_threads",
 )  # fmt: skip
 """Settings that have no effect on the evaluation of a policy."""
 SHOWN = "DoraHammer-v1"

@@ -243,7 +243,7 @@ def terms(c: CubeConfig) -> Terms[Snapshot]:
                 doc="rise, saturating at the target height, once it is grasped",
             ),
             "held": Term(clean, w.held, doc="lifted, opposed, off the table, and no overlap above the limit so far"),
-            **penalties(w, c.free_overlap, c.penetration_limit),
+            **penalties(w, c.free_overlap, c.penetration_limit, c.overlap_range),
         }
     )  # fmt: skip
 

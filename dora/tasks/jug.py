@@ -259,7 +259,7 @@ def terms(c: JugConfig) -> Terms[Snapshot]:
                 clean, w.held, doc="lifted, upright, opposed, by the handle, off the table, never too much overlap"
             ),
             "tilt": Term(tilt, w.tilt, "penalty", doc="tilt, as a share of the largest that counts as lifted"),
-            **penalties(w, c.free_overlap, c.penetration_limit),
+            **penalties(w, c.free_overlap, c.penetration_limit, c.overlap_range),
         }
     )  # fmt: skip
 

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
-from dora.agents.collecting.task_env import EpisodeEnds, TaskEnv, TaskFactory
+from dora.agents.collecting.task_env import TaskEnv, TaskFactory, TrainingRules
 from dora.agents.learners.networks import Policy
 from dora.errors import InputError, WorkerFailure, said
 
@@ -28,7 +28,7 @@ class ActorCollector(Collector):
 
 
 def ray_collector(
-    make_task: TaskFactory, policy: Policy, *, frames: int, seeds: Sequence[int], ends: EpisodeEnds
+    make_task: TaskFactory, policy: Policy, *, frames: int, seeds: Sequence[int], rules: TrainingRules
 ) -> Any:
     """A collector whose workers, one for each seed, are actors of a Ray cluster; each takes one core.
 
@@ -39,7 +39,7 @@ def ray_collector(
         policy: whose weights the workers get by `update_policy_weights_`.
         frames: transitions of a batch, of all workers.
         seeds: of their tasks and their exploration.
-        ends: see `TaskEnv`.
+        rules: see `TaskEnv`.
 
     Raises:
         InputError: Ray is not installed, or no cluster answers.
@@ -62,7 +62,7 @@ def ray_collector(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         return RayCollector(
-            [functools.partial(_worker_env, make_task, seed, ends) for seed in seeds],
+            [functools.partial(_worker_env, make_task, seed, rules) for seed in seeds],
             policy,
             collector_class=ActorCollector,  # pyright: ignore[reportArgumentType]
             frames_per_batch=frames,
@@ -74,12 +74,12 @@ def ray_collector(
         )
 
 
-def _worker_env(make_task: TaskFactory, seed: int, ends: EpisodeEnds) -> TaskEnv:
+def _worker_env(make_task: TaskFactory, seed: int, rules: TrainingRules) -> TaskEnv:
     """The environment of a worker, in its process."""
     torch.set_num_threads(1)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     torch.manual_seed(seed)
-    return TaskEnv(make_task(), seed=seed, ends=ends)
+    return TaskEnv(make_task(), seed=seed, rules=rules)
 
 
 def whole_batch(batch: TensorDictBase) -> TensorDictBase:

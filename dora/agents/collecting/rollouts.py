@@ -20,7 +20,7 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector, MultiSyncCollector
 
 from dora.agents.collecting.ray_collector import explained, ray_collector, whole_batch
-from dora.agents.collecting.task_env import EpisodeEnds, Task, TaskEnv, TaskFactory
+from dora.agents.collecting.task_env import Task, TaskEnv, TaskFactory, TrainingRules
 from dora.agents.learners.networks import Policy
 from dora.errors import InputError, RunFailure, WorkerFailure, said
 from dora.parallel import name_leftovers, name_of_process, signals_blocked
@@ -54,9 +54,9 @@ class WorkerTaskEnv(TaskEnv):
     TorchRL itself tells the main process only that a worker ended.
     """
 
-    def __init__(self, task: Task, report: Path, *, seed: int, ends: EpisodeEnds):
+    def __init__(self, task: Task, report: Path, *, seed: int, rules: TrainingRules):
         self.report = report
-        super().__init__(task, seed=seed, ends=ends)
+        super().__init__(task, seed=seed, rules=rules)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         with _reported(self.report):
@@ -78,12 +78,12 @@ def _reported(report: Path) -> Iterator[None]:
         raise SystemExit(1) from None
 
 
-def _make_worker_env(make_task: TaskFactory, report: Path, seed: int, ends: EpisodeEnds, nice: int) -> WorkerTaskEnv:
+def _make_worker_env(make_task: TaskFactory, report: Path, seed: int, rules: TrainingRules, nice: int) -> WorkerTaskEnv:
     torch.set_num_threads(1)
     os.nice(nice)
     torch.manual_seed(seed)
     with _reported(report):
-        return WorkerTaskEnv(make_task(), report, seed=seed, ends=ends)
+        return WorkerTaskEnv(make_task(), report, seed=seed, rules=rules)
 
 
 class _Workers(MultiSyncCollector):
@@ -116,7 +116,7 @@ class Rollouts:
         workers: worker processes, or 0 to collect in this process.
         rollout: control steps per environment and batch.
         seeds: one per worker (one if `workers` is 0), for its tasks and its exploration.
-        ends: see `TaskEnv`.
+        rules: see `TaskEnv`.
         ahead: workers go on with the next batch while the caller learns from this one, so that all cores are busy;
             a batch then comes from the policy as it was one call of `collect` earlier. Without workers it changes
             nothing.
@@ -137,7 +137,7 @@ class Rollouts:
         num_envs: int,
         rollout: int,
         seeds: Sequence[int],
-        ends: EpisodeEnds,
+        rules: TrainingRules,
         ahead: bool = False,
         check: Callable[[], None] = lambda: None,
         cluster: bool = False,
@@ -154,9 +154,9 @@ class Rollouts:
         self._own: OwnTaskEnv | None = None
         if self._cluster:
             frames = workers * num_envs * rollout
-            self._collector: Any = ray_collector(make_task, self._acting, frames=frames, seeds=seeds, ends=ends)
+            self._collector: Any = ray_collector(make_task, self._acting, frames=frames, seeds=seeds, rules=rules)
         elif workers == 0:
-            self._own = OwnTaskEnv(make_task(), seed=seeds[0], ends=ends)
+            self._own = OwnTaskEnv(make_task(), seed=seeds[0], rules=rules)
             self._collector = Collector(
                 self._own,
                 policy,
@@ -167,7 +167,7 @@ class Rollouts:
             )
         else:
             factories = [
-                functools.partial(_make_worker_env, make_task, report, seed, ends, LESS_URGENT if ahead else 0)
+                functools.partial(_make_worker_env, make_task, report, seed, rules, LESS_URGENT if ahead else 0)
                 for report, seed in zip(self._reports, seeds, strict=True)
             ]
             self._collector = self._started(

@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 
 from dora.agents.agent_columns import AgentColumns, checked_agents
 from dora.agents.seeds import seeds_for
+from dora.errors import InputError
 
 
 @runtime_checkable
@@ -81,6 +82,8 @@ class Task(Protocol):
         ...
 
 
+PENALTY = "reward/penetration"
+"""Name of what the penalty for overlap adds to the reward, 0 or below."""
 NONFINITE = "nonfinite"
 """Name of the column that says in which episodes something was not finite."""
 TaskFactory = Callable[[], Task]
@@ -128,17 +131,42 @@ class EpisodeColumns:
 
 
 @dataclass(frozen=True)
-class EpisodeEnds:
-    """When episodes of a training end, apart from failing and the task's own limit.
+class Easing:
+    """A penalty for overlap that grows in the course of a training: a hand that does not grasp yet avoids contact
+    altogether where contact costs more than it earns.
+
+    Attributes:
+        share: of the penalty that counts at the first step of the run, above 0.
+        steps: environment steps of the whole run after which all of it counts; until then it grows geometrically.
+        begun: environment steps of the run before this part of it, in which it was interrupted.
+        workers: batches that step at the same time.
+    """
+
+    share: float = 1.0
+    steps: int = 1
+    begun: int = 0
+    workers: int = 1
+
+    def at(self, own: int) -> float:
+        """The share of the penalty that counts after `own` environment steps of a batch: share^(1 - done/steps)."""
+        done = (self.begun + self.workers * own) / self.steps
+        return self.share ** max(1.0 - done, 0.0)
+
+
+@dataclass(frozen=True)
+class TrainingRules:
+    """What episodes of a training have that those of evaluations lack.
 
     Attributes:
         stagger: end each first episode at a random step, so that resets spread over time. Statistics of such an episode
             have `whole` = 0.
         after_success: control steps after its first success at which an episode is truncated; None: never.
+        easing: how much of the penalty for overlap counts.
     """
 
     stagger: bool = False
     after_success: int | None = None
+    easing: Easing = Easing()
 
 
 class TaskEnv(EnvBase):
@@ -155,16 +183,24 @@ class TaskEnv(EnvBase):
         task: the batch to step; closed with this environment.
         seed: gives the rows their seeds in the first reset; later resets go on from there. ManiSkill itself would draw
             them, but for the first row's, from all numbers below 2^31, those of evaluation among them.
-        ends: when episodes end early.
+        rules: what the episodes of a training have, such as early ends; evaluations leave it out.
+
+    Raises:
+        InputError: the penalty for overlap is to be eased, and the task's reward has none.
     """
 
-    def __init__(self, task: Task, *, seed: int | None = None, ends: EpisodeEnds = EpisodeEnds()):
+    def __init__(self, task: Task, *, seed: int | None = None, rules: TrainingRules = TrainingRules()):
         super().__init__(device=task.device, batch_size=torch.Size([task.num_envs]))
-        self.task, self.ends = task, ends
+        self.task, self.rules, self._own_steps = task, rules, 0
+        if rules.easing.share < 1 and PENALTY not in task.logged:
+            raise InputError(
+                "--overlap-share eases the penalty for overlap, and this reward has none: leave it out, or use "
+                "--reward dense."
+            )
         self._pending_seed: list[int] | None = None
         self.columns = EpisodeColumns.of(tuple(dict.fromkeys((*task.logged, NONFINITE))))
         self._limit = torch.full((task.num_envs,), task.max_steps, device=task.device)
-        if ends.stagger:
+        if rules.stagger:
             generator = torch.Generator().manual_seed(0 if seed is None else seed)
             self._limit[:] = torch.randint(1, task.max_steps + 1, self._limit.shape, generator=generator)
         self._whole = self._limit == task.max_steps
@@ -253,10 +289,11 @@ class TaskEnv(EnvBase):
         action = tensordict.get("action").clamp(self._low, self._high)
         observation, reward, _, _, info = self.task.step(action)
         fail = info.get("fail")
-        if self.ends.after_success is not None and "success" in info:
-            self._shorten(info["success"].to(torch.bool).reshape(-1), self.ends.after_success)
+        if self.rules.after_success is not None and "success" in info:
+            self._shorten(info["success"].to(torch.bool).reshape(-1), self.rules.after_success)
         truncated = self.task.elapsed_steps >= self._limit
         terminated = torch.zeros_like(truncated) if fail is None else fail.to(torch.bool).reshape(-1)
+        reward = self._eased(reward, info)
         bad = _bad_rows(observation, reward, info)
         if bad.any():
             observation, reward = _zeroed(observation, bad), torch.where(bad, torch.zeros_like(reward), reward)
@@ -276,6 +313,12 @@ class TaskEnv(EnvBase):
             batch_size=self.batch_size,
             device=self.device,
         )
+
+    def _eased(self, reward: Float[Tensor, "*n"], info: dict[str, Any]) -> Float[Tensor, "*n"]:
+        """The reward with the share of the penalty for overlap that counts now; counts the steps."""
+        share = self.rules.easing.at(self._own_steps)
+        self._own_steps += self.batch_size[0]
+        return reward if share == 1 else reward - (1 - share) * info[PENALTY].reshape(reward.shape)
 
     def _shorten(self, success: Bool[Tensor, " n"], after: int) -> None:
         """Lets the episodes that have succeeded end some steps from now, unless they end before."""

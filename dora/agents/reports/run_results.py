@@ -38,6 +38,8 @@ WITHOUT_OVERLAP = {"after_overlap": "1.0", "placed_after_overlap": "1.0", "weigh
 ALWAYS = ("optimised",)
 """Numbers of tasks that are named whatever most runs of a row have, since neither of their values is the usual one."""
 
+EASED = ", overlap eased"
+"""What is added to the guidance of runs whose training began with a share of the penalty for overlap."""
 EARLIER = ", earlier rules"
 """What is added to the guidance of runs whose task has other rules now."""
 
@@ -70,6 +72,7 @@ class Run:
         agent = result["agent"].upper()
         agent += ", paper's reward" if result.get("reward", "dense") == "paper" else ""
         agent += ", evaluated again" if result.get("checkpoint") else ""
+        guidance += EASED if result.get("overlap_share", 1.0) < 1 else ""
         guidance += EARLIER if self.outdated else ""
         return result["env"], task.get("preset", DEFAULT_PRESET), agent, guidance, round(self.budget / 1000)
 

@@ -299,6 +299,7 @@ def make_result(
         "steps_to_50": steps_to(0.5, curve),
         "steps_to_80": steps_to(0.8, curve),
         "reward": config.reward,
+        "overlap_share": config.overlap_share,
         "total_steps": config.total_steps,
         "first_seed": some.first_seed if some else None,
         "other_load": other_seconds / wall_seconds if other_seconds is not None and wall_seconds > 0 else None,

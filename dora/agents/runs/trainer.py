@@ -27,7 +27,14 @@ from dora.agents.checkpoint import (
     whole,
 )
 from dora.agents.collecting.rollouts import Rollouts
-from dora.agents.collecting.task_env import NONFINITE, EpisodeColumns, EpisodeEnds, MakeTask, ended_episodes
+from dora.agents.collecting.task_env import (
+    NONFINITE,
+    Easing,
+    EpisodeColumns,
+    MakeTask,
+    TrainingRules,
+    ended_episodes,
+)
 from dora.agents.config import RunConfig
 from dora.agents.counters import LEARNER, Counters, checked_counters
 from dora.agents.evaluation.evaluate import PERIODIC_SEED, Evaluation, outcome
@@ -173,14 +180,16 @@ class Trainer:
 
     def _rollouts(self, interrupt: Interrupt) -> Rollouts:
         config = self.config
+        workers = max(config.workers, 1)
+        easing = Easing(config.overlap_share, config.overlap_steps, self.counters.env_steps, workers)
         rollouts = Rollouts(
             functools.partial(self.make_task, config.num_envs),
             self.learner.policy,
             workers=config.workers,
             num_envs=config.num_envs,
             rollout=self.learner.rollout,
-            seeds=seeds_for(config.seed, self.counters.env_steps + 1, max(config.workers, 1)),
-            ends=EpisodeEnds(config.stagger, config.after_success),
+            seeds=seeds_for(config.seed, self.counters.env_steps + 1, workers),
+            rules=TrainingRules(config.stagger, config.after_success, easing),
             ahead=self.learner.replay is not None,
             check=interrupt.check,
             cluster=self._cluster,

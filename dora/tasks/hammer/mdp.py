@@ -117,7 +117,7 @@ def terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
             "driven": Term(
                 driven, w.driven, doc=f"all stages done, and no overlap above {limit} so far"
             ),
-            **penalties(w, c.free_overlap, c.penetration_limit),
+            **penalties(w, c.free_overlap, c.penetration_limit, c.overlap_range),
         }
     )  # fmt: skip
 

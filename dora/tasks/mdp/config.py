@@ -44,6 +44,8 @@ class TaskConfig:
     """PhysX's contact offset of the objects, and of every body without its own [m]."""
     penetration_limit: float = 0.005
     """Largest overlap in an episode that counts as a success [m]."""
+    overlap_range: float = 1.0
+    """Overlap above which its penalty does not grow, in units of `penetration_limit` [1]."""
     arm_effort: float = 1.0
     """Share of their torque limits with which the drives of an arm work; control modes of joints ignore it [1]."""
     pose_filter: float = 1.0

@@ -71,21 +71,23 @@ def overlap(free: float, limit: float) -> Value:
     return lambda s: ((s.penetration - free) / limit).clamp(0, 1).nan_to_num(0.0)
 
 
-def penalties(weights: Any, free: float, limit: float) -> dict[str, Term[Any]]:
+def penalties(weights: Any, free: float, limit: float, most: float = 1.0) -> dict[str, Term[Any]]:
     """Penalty terms of every task.
 
     Args:
         weights: has `effort`, `change` and `penetration`.
         free: overlap that costs nothing [m].
-        limit: largest overlap of an episode that counts as a success [m].
+        limit: largest overlap of an episode that counts as a success [m]; each costs `weights.penetration`.
+        most: how many of these overlap costs at most.
     """
     return {
         "effort": Term(effort, weights.effort, "penalty", doc="sum of action^2, over the number of its components"),
         "change": Term(change, weights.change, "penalty", doc="mean square of the action's change"),
         "penetration": Term(
-            overlap(free, limit), weights.penetration, "penalty", doc=f"overlap beyond {1000 * free:g} mm"
+            overlap(free, most * limit), most * weights.penetration, "penalty",
+            doc=f"overlap beyond {1000 * free:g} mm",
         ),
-    }
+    }  # fmt: skip
 
 
 def paper_affordance(point: Callable[[Any], Float[Tensor, "n 3"]]) -> dict[str, Term[Any]]:

@@ -260,7 +260,7 @@ def terms(c: MicrowaveConfig) -> Terms[MicrowaveSnapshot]:
                 doc="the cube lies inside, hand out, door open; "
                 f"{c.placed_after_overlap:g} of it after an overlap above the limit",
             ),
-            **penalties(w, c.free_overlap, c.penetration_limit),
+            **penalties(w, c.free_overlap, c.penetration_limit, c.overlap_range),
         }
     )  # fmt: skip
 
