@@ -1,11 +1,14 @@
 """Task environment: TorchRL's contract, true last observations, statistics."""
 
+import dataclasses
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from fake_task import PointMass
 from refusals import refused
+from short_runs import BASE, run
 from tensordict import TensorDict
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
@@ -183,3 +186,8 @@ def test_a_penalty_that_a_reward_lacks_cannot_be_eased():
     with refused("this reward has none"):
         TaskEnv(PointMass(2), rules=TrainingRules(easing=Easing(0.5, 10)))
     TaskEnv(PointMass(2), rules=TrainingRules(easing=Easing(1.0, 10)))
+
+
+def test_the_settings_of_a_run_reach_its_environments(tmp_path: Path):
+    with refused("this reward has none", seconds=60):
+        run(tmp_path / "run", dataclasses.replace(BASE, overlap_share=0.5, overlap_steps=100, workers=0))

@@ -9,7 +9,7 @@ import imageio.v2 as imageio
 import pytest
 
 from dora.agents.reports.report import pooled, tables, write_report
-from dora.agents.reports.run_results import find_runs, zero_shares
+from dora.agents.reports.run_results import find_runs, grouped, zero_shares
 from dora.agents.runs.progress_table import ProgressTable
 from dora.errors import InputError
 
@@ -227,3 +227,12 @@ def test_results_without_a_seed_are_reported(tmp_path: Path):
         path.write_text(json.dumps(content))
     write_report(tmp_path, tmp_path / "out")
     assert "| 2 |" in (tmp_path / "out" / "tables.md").read_text()
+
+
+def test_numbers_that_change_nothing_make_no_row_of_their_own(tmp_path: Path):
+    """A later version stores how far a hammer is turned in the hand also where it is turned by the wrist."""
+    for seed, task in enumerate(({"reorient": "wrist"}, {"reorient": "wrist", "turn": {"least": 0.7}}, {})):
+        write_run(tmp_path / str(seed), seed, 0.9)
+        path = tmp_path / str(seed) / "result.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"task_config": task}))
+    assert [len(runs) for runs in grouped(find_runs(tmp_path)).values()] == [3]

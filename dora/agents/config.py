@@ -242,6 +242,13 @@ def _digested(content: Mapping[str, Any]) -> dict[str, Any]:
     return kept | {"task": task, "learner": learner}
 
 
+def in_effect(numbers: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers of a task with those that earlier versions lack, without those that change nothing beside the others."""
+    whole = NEUTRAL | dict(numbers)
+    idle = {name for name, (other, value) in WITHOUT_EFFECT.items() if whole.get(other) == value}
+    return {name: value for name, value in whole.items() if name not in idle}
+
+
 def stored_digests(content: Mapping[str, Any]) -> tuple[str, ...]:
     """The digests that settings may have been stored with: that of `RunConfig.digest`, that of versions that left no
     number of the task out, and that of the versions whose `task` held only preset and parts of guidance."""

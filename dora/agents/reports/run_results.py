@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from dora.agents.config import NEUTRAL, NEUTRAL_LEARNER
+from dora.agents.config import NEUTRAL, NEUTRAL_LEARNER, in_effect
 from dora.agents.evaluation.evaluate import FINAL_SEED
 from dora.agents.runs.progress_table import read_progress
 from dora.agents.runs.stored_results import check_agreement, read_curve, read_episodes, read_result
@@ -132,7 +132,7 @@ def _with_zero(runs: Sequence[Run]) -> list[Run]:
     def starts(run: Run) -> tuple[Any, ...]:
         r = run.result
         first = r.get("first_seed", FINAL_SEED), r.get("eval_episodes")
-        return r["env"], run.group[1], run.group[3], str(sorted(flat(NEUTRAL | (r.get("task_config") or {})))), *first
+        return r["env"], run.group[1], run.group[3], str(sorted(flat(in_effect(r.get("task_config") or {})))), *first
 
     measured = {starts(run): run for run in runs if run.result["zero_success_rate"] is not None}
     filled = []
@@ -172,7 +172,7 @@ def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
     more runs have than have anything else goes without saying."""
     known = all("learner_config" in run.result for run in runs)  # results of earlier versions lack it
     numbers = [
-        dict(flat(NEUTRAL | (run.result.get("task_config") or {}))) | (_learner(run) if known else {}) for run in runs
+        dict(flat(in_effect(run.result.get("task_config") or {}))) | (_learner(run) if known else {}) for run in runs
     ]
     names = sorted({name for each in numbers for name in each})
     different = [name for name in names if len({str(each.get(name)) for each in numbers}) > 1]
