@@ -1,6 +1,5 @@
 """The run command refuses bad input with one sentence and exit status 2."""
 
-import copy
 import dataclasses
 import json
 import os
@@ -19,12 +18,6 @@ import dora.agents
 from dora.agents.checkpoint import read_checkpoint
 from dora.agents.config import (
     LEARNER_CONFIGS,
-    NEUTRAL,
-    NEUTRAL_LEARNER,
-    NOT_USUAL,
-    UNUSED,
-    config_from_dict,
-    stored_digests,
 )
 from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed
 from dora.agents.evaluation.play import load_policy
@@ -32,7 +25,6 @@ from dora.agents.runs.recommended import learners_of, recommended
 from dora.agents.runs.run_folder import RunFolder
 from dora.commands import run
 from dora.configs import plain
-from dora.digests import digest_of
 from dora.errors import RECORDS, InputError
 from dora.tasks import find_task, make_task
 from dora.tasks.cube import CubeConfig, paper_terms
@@ -143,32 +135,6 @@ def test_every_spelling_of_an_option_is_the_same(words: str, like: str):
     assert run.parse(words.format(COMMITTED[0]).split()) == run.parse(like.format(COMMITTED[0]).split())
 
 
-def test_policies_from_before_poses_were_filtered_meet_poses_as_measured():
-    path = next(path for path in COMMITTED if path.parent.name == "sac-affordance-hard-s10")
-    content: dict[str, Any] = plain(read_checkpoint(path).config)
-    assert content["task"].pop("pose_filter") < 1
-    config = config_from_dict(content)
-    numbers: Any = task_config(find_task(config.env).CONFIG, config.preset, config.task)
-    assert (config.preset, numbers.pose_filter) == ("hard", 1.0)
-    assert find_task(config.env).CONFIG.BY_PRESET["hard"]["pose_filter"] < 1
-
-
-@pytest.mark.parametrize(
-    ("options", "equal"),
-    [
-        ("", False), ("--guidance grasps", False), ("--guidance none", True),
-        ("--guidance-parts prior reward", True), ("--guidance-parts observation", False),
-    ],
-)  # fmt: skip
-def test_a_candidate_that_nobody_observes_does_not_change_the_digest(options: str, equal: bool):
-    config = run.parse(["--env", "DoraHammer-v1", *options.split()]).run
-    seen, unseen = (dataclasses.replace(config, task=config.task | {"observe_candidate": it}) for it in (True, False))
-    assert (seen.digest() == unseen.digest()) == equal
-    before = dataclasses.replace(config, task={k: v for k, v in config.task.items() if k != "observe_candidate"})
-    assert unseen.digest() == before.digest()
-    assert config_from_dict(plain(before)).task["observe_candidate"] is False
-
-
 def test_an_evaluation_under_another_preset_has_all_numbers_of_it():
     for env_id in ("DoraJug-v1", "DoraMicrowave-v1"):
         path = next(path for path in COMMITTED if path.parents[1].name == env_id and "hard" not in path.parent.name)
@@ -176,27 +142,6 @@ def test_an_evaluation_under_another_preset_has_all_numbers_of_it():
         wanted = task_config(find_task(env_id).CONFIG, "hard", None)
         assert config.task["randomisation"] == plain(wanted.randomisation)
         assert config.task["pose_filter"] == wanted.pose_filter
-
-
-def test_a_policy_is_evaluated_by_the_rules_of_now(tmp_path: Path):
-    """Whatever rules it was trained by; its digest says that these are others."""
-    path = next(path for path in COMMITTED if path.parents[1].name == "DoraHammer-v1")
-    checkpoint = read_checkpoint(path)
-    earlier = dataclasses.replace(checkpoint.config, task=checkpoint.config.task | {"definition": 1})
-    old = dataclasses.replace(checkpoint, config=earlier, config_digest=earlier.digest())
-    old.write(tmp_path / "old.safetensors")
-    assert run.parse(f"--eval-only --checkpoint {tmp_path / 'old.safetensors'}".split()).run.task["definition"] == 2
-
-
-def test_settings_of_earlier_versions_can_be_read_and_are_refused_for_new_runs(tmp_path: Path):
-    stored = recommended("DoraCube-v1", "ppo")
-    wide = dataclasses.replace(stored, final_episodes=20_000, learner=dataclasses.replace(stored.learner, log_std=0.3))
-    RunFolder(tmp_path).create(wide)
-    assert RunFolder(tmp_path).read_config() == wide
-    assert run.parse(["--resume", str(tmp_path)]).run.final_episodes == 20_000
-    for option, value in (("--episodes", "20000"), ("--eval-episodes", "20000"), ("--learner.log-std", "0.3")):
-        with pytest.raises(InputError, match=option):
-            run.parse(["--env", "DoraCube-v1", "--agent", "ppo", option, value])
 
 
 def test_settings_of_training_do_not_change_an_evaluation(
@@ -278,20 +223,6 @@ def test_a_bundled_policy_is_that_of_the_result_beside_it(path: Path):
         assert result["checkpoint"] == str(path.relative_to(Path(__file__).parents[1]))
     else:
         assert checkpoint.config_digest == result["config_digest"]
-
-
-@pytest.mark.parametrize("path", COMMITTED, ids=lambda path: f"{path.parts[-3]}/{path.parts[-2]}")
-def test_policies_of_versions_without_numbers_mean_the_numbers_of_then(path: Path):
-    config = read_checkpoint(path).config
-    task = find_task(config.env).CONFIG
-    known = json.loads((path.parent / "result.json").read_text()).get("task_config")
-    if known is not None:  # a later version, which says its numbers
-        known = NOT_USUAL | known
-        assert task_config(task, config.preset, config.task) == task_config(task, config.preset, known)
-        return
-    first = yaml.safe_load(FIRST.read_text())
-    assert config.task == first["tasks"][config.env] | {"randomisation": first["presets"][config.preset]}
-    task_config(task, config.preset, config.task)  # every name is known
 
 
 def test_a_bundled_policy_can_be_evaluated_alone(
@@ -397,22 +328,3 @@ def test_the_reward_of_the_paper_trains(script: ModuleType, tmp_path: Path, monk
     assert [name.removeprefix("reward/") for name in header if name.startswith("reward/")] == [
         *paper_terms(CubeConfig()).terms
     ]
-
-
-def test_settings_without_a_reward_mean_the_dense_one_and_keep_their_digest():
-    config = run.parse(["--env", "DoraCube-v1"]).run
-    content = copy.deepcopy(plain(config))
-    assert {name: content.pop(name) for name in UNUSED} == UNUSED
-    assert config_from_dict(content) == config
-    del content["total_steps"]
-    whole = digest_of(content)[:12]
-    there = {name: value for name, value in NEUTRAL.items() if name in content["task"]}
-    assert {name: content["task"].pop(name) for name in there} == there
-    assert len(there) > 1
-    neutral = NEUTRAL_LEARNER["sac"]
-    assert {name: content["learner"].pop(name) for name in neutral} == neutral
-    assert config.digest() == digest_of(content)[:12] == stored_digests(content)[0]
-    assert whole in stored_digests(plain(config))
-    weaker = dataclasses.replace(config, task=config.task | {"arm_effort": 0.5})
-    assert weaker.digest() != config.digest()
-    assert config.digest() != run.parse(["--env", "DoraCube-v1", "--reward", "paper"]).run.digest()

@@ -1,5 +1,7 @@
 """Values of reward terms on invented states, worked out by hand."""
 
+import dataclasses
+from collections.abc import Callable
 from math import cos, exp, pi
 from typing import Any
 
@@ -15,6 +17,8 @@ from dora.tasks.hammer import mdp as hammer
 from dora.tasks.hammer.task import HammerConfig
 from dora.tasks.mdp import terms
 from dora.tasks.mdp.snapshot import Snapshot
+from dora.tasks.microwave import mdp as microwave
+from dora.tasks.microwave.mdp import MicrowaveConfig
 
 HALFWAY = 2 / (1 + 10**0.5)
 """What `tolerance` is at half its margin: 1 / cosh(a / 2)^2, where 1 / cosh(a)^2 = 0.1."""
@@ -96,6 +100,19 @@ def test_overlap_costs_from_what_is_free_to_a_limit_beyond_it():
     assert deeper.weight == 4 * weights.penetration
     depth = torch.tensor([0.0, 0.006, 0.011, 0.021, 0.1])
     assert deeper.value(invented(5, penetration=depth)).tolist() == close(0.0, 0.25, 0.5, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("made", "config"),
+    [(cube.terms, CUBE), (jug.terms, JUG), (hammer.terms, HAMMER), (microwave.terms, MicrowaveConfig())],
+    ids=["cube", "jug", "hammer", "microwave"],
+)
+def test_a_task_says_up_to_which_overlap_its_penalty_grows(made: Callable[[Any], Any], config: Any):
+    usual, wider = (
+        made(c).terms["penetration"].weight for c in (config, dataclasses.replace(config, overlap_range=4.0))
+    )
+    assert usual == config.weights.penetration
+    assert wider == 4 * usual
 
 
 def test_printed_terms_of_grasping_and_lifting():
