@@ -87,6 +87,24 @@ def test_hand_targets_reach_what_was_asked_no_faster_than_allowed(task: DoraEnv)
     torch.testing.assert_close(controller.target[0, 7:], torch.tensor(hand.upper, dtype=torch.float32))
 
 
+def test_finger_commands_move_no_faster_than_their_share_and_the_drives_of_the_arm_push_no_more():
+    task = tasks.make_task("DoraCube-v1", 1, "none", preset="none", config={"hand_speed": 0.25, "arm_effort": 0.5})
+    task.reset(seed=0)
+    controller, robot = task.agent.wrist_controller, task.agent.description
+    before = controller.target[:, 7:].clone()
+    action = torch.ones(1, task.action_size)
+    action[:, :6] = 0.0
+    for _ in range(2):
+        task.step(action)
+    share = torch.tensor(robot.hand.velocity, dtype=torch.float32) * controller.dt / 4
+    expected = torch.minimum(before + 2 * share, controller.hand_upper)
+    torch.testing.assert_close(controller.target[:, 7:], expected)
+    limits = [joint._objs[0].force_limit for joint in controller.joints]
+    whole = torch.tensor([*robot.arm.effort, *robot.hand.effort], dtype=torch.float64)
+    torch.testing.assert_close(torch.tensor(limits).double(), whole * torch.tensor([0.5] * 7 + [1.0] * 20))
+    task.close()
+
+
 def test_an_action_asks_for_the_joints_it_was_made_from(task: DoraEnv):
     controller = task.agent.wrist_controller
     joints = torch.rand(3, 20) * (controller.hand_upper - controller.hand_lower) + controller.hand_lower

@@ -72,6 +72,8 @@ class WristHandController(BaseController):
     sets_target_qvel = False
     arm_effort = 1.0
     """Share of their torque limits with which the drives of the arm work."""
+    hand_speed = 1.0
+    """Share of their velocity limits at which commands of finger joints move."""
 
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
@@ -111,12 +113,16 @@ class WristHandController(BaseController):
         self.wrist_scale = torch.tensor([speed] * 3 + [spin] * 3, device=self.device) * self.dt
         self.feed_forward = feed_forward
 
-    def limit_effort(self, share: float) -> None:
-        """Gives the drives of the arm a share of their torque limits, so that a hand that meets something pushes less.
+    def limit(self, arm_effort: float, hand_speed: float) -> None:
+        """Makes a hand gentler where it meets something.
 
-        The motion of the free arm needs little of them: it is bounded by its speed, not by its torques.
+        Args:
+            arm_effort: share of their torque limits that the drives of the arm get. The motion of the free arm needs
+                little of them: it is bounded by its speed, not by its torques.
+            hand_speed: share of the finger joints' velocity limits at which their commands move. At 1 a fingertip
+                closes at about 1 m/s and hits what it closes around.
         """
-        self.arm_effort = share
+        self.arm_effort, self.hand_speed = arm_effort, hand_speed
         self.set_drive_property()
 
     @property
@@ -223,7 +229,8 @@ class WristHandController(BaseController):
         arm = torch.clamp(arm, self.arm_lower, self.arm_upper)
         share = self.expand_hand(action[:, 6:]) / 2 + 0.5
         wanted = self.hand_lower + share * (self.hand_upper - self.hand_lower)
-        hand = hand + torch.clamp(wanted - hand, -self.hand_step, self.hand_step)
+        step = self.hand_speed * self.hand_step
+        hand = hand + torch.clamp(wanted - hand, -step, step)
         if self.feed_forward:
             self._tell_velocity((arm - self.target[:, : self.arm_size]) / self.dt)
         self.target = torch.cat([arm, hand], -1)

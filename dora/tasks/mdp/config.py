@@ -48,6 +48,8 @@ class TaskConfig:
     """Overlap above which its penalty does not grow, in units of `penetration_limit` [1]."""
     arm_effort: float = 1.0
     """Share of their torque limits with which the drives of an arm work; control modes of joints ignore it [1]."""
+    hand_speed: float = 1.0
+    """Share of their velocity limits at which commands of finger joints move; control modes of joints ignore it [1]."""
     pose_filter: float = 1.0
     """Share of the newest measurement in the estimated pose of an object, for policy and reference; 1: no filter."""
     hand_action: Literal["joints", "fingers"] = "joints"
