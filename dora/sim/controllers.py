@@ -70,8 +70,8 @@ class WristHandController(BaseController):
     config: "WristHandConfig"
     sets_target_qpos = True
     sets_target_qvel = False
-    arm_effort = 1.0
-    """Share of their torque limits with which the drives of the arm work."""
+    efforts = 1.0, 1.0
+    """Shares of their torque limits with which the drives of arm and hand work."""
     hand_speed = 1.0
     """Share of their velocity limits at which commands of finger joints move."""
 
@@ -113,16 +113,17 @@ class WristHandController(BaseController):
         self.wrist_scale = torch.tensor([speed] * 3 + [spin] * 3, device=self.device) * self.dt
         self.feed_forward = feed_forward
 
-    def limit(self, arm_effort: float, hand_speed: float) -> None:
-        """Makes a hand gentler where it meets something.
+    def limit(self, arm_effort: float, hand_effort: float, hand_speed: float) -> None:
+        """Makes arm and hand gentler where they meet something.
 
         Args:
             arm_effort: share of their torque limits that the drives of the arm get. The motion of the free arm needs
                 little of them: it is bounded by its speed, not by its torques.
+            hand_effort: the same of the hand. At 1 a finger presses with about 10 N at its tip.
             hand_speed: share of the finger joints' velocity limits at which their commands move. At 1 a fingertip
                 closes at about 1 m/s and hits what it closes around.
         """
-        self.arm_effort, self.hand_speed = arm_effort, hand_speed
+        self.efforts, self.hand_speed = (arm_effort, hand_effort), hand_speed
         self.set_drive_property()
 
     @property
@@ -133,10 +134,8 @@ class WristHandController(BaseController):
     def set_drive_property(self) -> None:
         """Gains, effort limits and armature from the robot's description."""
         robot = self.config.robot
-        for group, joints, share in (
-            (robot.arm, self.joints[: self.arm_size], self.arm_effort),
-            (robot.hand, self.joints[self.arm_size :], 1.0),
-        ):
+        groups, joints_of = (robot.arm, robot.hand), (self.joints[: self.arm_size], self.joints[self.arm_size :])
+        for group, joints, share in zip(groups, joints_of, self.efforts, strict=True):
             for i, joint in enumerate(joints):
                 joint.set_drive_properties(group.stiffness[i], group.damping[i], force_limit=share * group.effort[i])
                 for part in joint._objs:

@@ -36,6 +36,7 @@ from dora.tasks.mdp.snapshot import Snapshot, derived
 from dora.tasks.mdp.stages import Stage
 from dora.tasks.mdp.terms import (
     at_candidate,
+    beyond_the_limit,
     finger_contacts,
     near_region,
     paper_affordance,
@@ -44,6 +45,7 @@ from dora.tasks.mdp.terms import (
     paper_penalty,
     penalties,
     while_active,
+    without_overlap,
 )
 
 
@@ -221,7 +223,7 @@ def terms(c: CubeConfig) -> Terms[Snapshot]:
         return rise(s, c.lift) * (0.3 + 0.7 * opposed(s).float())
 
     def clean(s: Snapshot) -> Tensor:
-        return (held(s, c) & (s.max_penetration <= c.penetration_limit)).float()
+        return held(s, c) * without_overlap(s, c)
 
     return Terms(
         {
@@ -242,7 +244,10 @@ def terms(c: CubeConfig) -> Terms[Snapshot]:
                 lambda s: torch.where(s.stage >= LIFT, lift(s), 0.0), w.lift,
                 doc="rise, saturating at the target height, once it is grasped",
             ),
-            "held": Term(clean, w.held, doc="lifted, opposed, off the table, and no overlap above the limit so far"),
+            "held": Term(
+                clean, w.held,
+                doc=f"lifted, opposed, off the table, and no overlap above the limit so far{beyond_the_limit(c)}",
+            ),
             **penalties(w, c.free_overlap, c.penetration_limit, c.overlap_range),
         }
     )  # fmt: skip

@@ -37,6 +37,7 @@ from dora.tasks.mdp.snapshot import Snapshot, derived, derived_from_contacts
 from dora.tasks.mdp.stages import Stage
 from dora.tasks.mdp.terms import (
     at_candidate,
+    beyond_the_limit,
     finger_contacts,
     near_region,
     paper_affordance,
@@ -45,6 +46,7 @@ from dora.tasks.mdp.terms import (
     paper_penalty,
     penalties,
     while_active,
+    without_overlap,
 )
 
 REACH, GRASP, LIFT = range(3)
@@ -231,7 +233,7 @@ def terms(c: JugConfig) -> Terms[Snapshot]:
         return rise(s, c.lift) * (0.3 + 0.7 * grasped.float()) * level.clamp(0, 1) * (s.stage >= LIFT)
 
     def clean(s: Snapshot) -> Tensor:
-        return (held(s, c) & by_the_handle(s) & (s.max_penetration <= c.penetration_limit)).float()
+        return (held(s, c) & by_the_handle(s)) * without_overlap(s, c)
 
     def tilt(s: Snapshot) -> Tensor:
         return (uprightness(s).clamp(-1, 1).acos() / c.upright).clamp(0, 1)
@@ -256,7 +258,9 @@ def terms(c: JugConfig) -> Terms[Snapshot]:
                 lift, w.lift, doc="rise once it is grasped, saturating, less if tilted or not held by the handle"
             ),
             "held": Term(
-                clean, w.held, doc="lifted, upright, opposed, by the handle, off the table, never too much overlap"
+                clean, w.held,
+                doc="lifted, upright, opposed, by the handle, off the table, never too much overlap"
+                + beyond_the_limit(c),
             ),
             "tilt": Term(tilt, w.tilt, "penalty", doc="tilt, as a share of the largest that counts as lifted"),
             **penalties(w, c.free_overlap, c.penetration_limit, c.overlap_range),

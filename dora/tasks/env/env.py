@@ -134,7 +134,7 @@ class DoraEnv(BaseEnv):
         super()._load_agent(options, poses)
         for agent in getattr(self.agent, "agents", [self.agent]):
             if agent.commands_wrist:
-                agent.wrist_controller.limit(self.config.arm_effort, self.config.hand_speed)
+                agent.wrist_controller.limit(self.config.arm_effort, self.config.hand_effort, self.config.hand_speed)
                 if self.task.WRIST_MOTION is not None:
                     agent.wrist_controller.set_motion(*self.task.WRIST_MOTION, feed_forward=True)
 

@@ -20,7 +20,16 @@ from dora.tasks.mdp.memory import EpisodeMemory
 from dora.tasks.mdp.rewards import Term, Terms, tolerance
 from dora.tasks.mdp.snapshot import Snapshot, derived
 from dora.tasks.mdp.stages import Stage
-from dora.tasks.mdp.terms import at_candidate, near_region, paper_affordance, paper_grasp, paper_penalty, penalties
+from dora.tasks.mdp.terms import (
+    at_candidate,
+    beyond_the_limit,
+    near_region,
+    paper_affordance,
+    paper_grasp,
+    paper_penalty,
+    penalties,
+    without_overlap,
+)
 
 if TYPE_CHECKING:
     from dora.tasks.hammer.task import HammerConfig
@@ -67,7 +76,7 @@ def stages(c: "HammerConfig") -> list[Stage[HammerSnapshot]]:
 
 def terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
     """The reward."""
-    w, limit = c.weights, f"{1000 * c.penetration_limit:g} mm"
+    w, limit = c.weights, f"{1000 * c.penetration_limit:g} mm{beyond_the_limit(c)}"
     strikes = strike_stage(c)
 
     def catch(s: HammerSnapshot) -> Tensor:
@@ -84,14 +93,11 @@ def terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
         held = in_hand(s, c) & (s.stage >= strikes - 1)
         return torch.where(s.stage > strikes, 1.0, held * poise(s))
 
-    def clean(s: HammerSnapshot) -> Tensor:
-        return (s.max_penetration <= c.penetration_limit).float()
-
     def strike(s: HammerSnapshot) -> Tensor:
-        return driven_share(s, c) * (c.after_overlap + (1 - c.after_overlap) * clean(s))
+        return driven_share(s, c) * without_overlap(s, c, c.after_overlap)
 
     def driven(s: HammerSnapshot) -> Tensor:
-        return ((s.nail_driven >= c.nail.driven) & (s.stage > strikes)).float() * clean(s)
+        return ((s.nail_driven >= c.nail.driven) & (s.stage > strikes)) * without_overlap(s, c)
 
     return Terms(
         {

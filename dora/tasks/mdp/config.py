@@ -46,8 +46,13 @@ class TaskConfig:
     """Largest overlap in an episode that counts as a success [m]."""
     overlap_range: float = 1.0
     """Overlap above which its penalty does not grow, in units of `penetration_limit` [1]."""
+    overlap_grace: float = 0.0
+    """Overlap above `penetration_limit` over which the reward for what is done without too much of it falls, in units
+    of that limit; 0: at once. What counts as a success does not depend on it [1]."""
     arm_effort: float = 1.0
     """Share of their torque limits with which the drives of an arm work; control modes of joints ignore it [1]."""
+    hand_effort: float = 1.0
+    """Share of their torque limits with which the drives of a hand work; control modes of joints ignore it [1]."""
     hand_speed: float = 1.0
     """Share of their velocity limits at which commands of finger joints move; control modes of joints ignore it [1]."""
     pose_filter: float = 1.0

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.quantities import goal_error, lifted, opposed
 from dora.tasks.mdp.rewards import Term, tolerance
 from dora.tasks.mdp.snapshot import Snapshot
@@ -69,6 +70,22 @@ def change(s: Snapshot) -> Float[Tensor, " n"]:
 def overlap(free: float, limit: float) -> Value:
     """Term for overlap beyond `free`, in shares of `limit` [m]; 0 where the simulator does not report overlap (NaN)."""
     return lambda s: ((s.penetration - free) / limit).clamp(0, 1).nan_to_num(0.0)
+
+
+def without_overlap(s: Any, c: TaskConfig, left: float = 0.0) -> Float[Tensor, " n"]:
+    """1 while no overlap of the episode was above `c.penetration_limit`; beyond it falls linearly over
+    `c.overlap_grace` limits, or at once if that is 0, to `left`, which NaN gives, too."""
+    limit, deepest = c.penetration_limit, s.max_penetration
+    share = torch.zeros_like(deepest)
+    if c.overlap_grace > 0:
+        share = (1 - (deepest - limit) / (c.overlap_grace * limit)).clamp(min=0).nan_to_num(0.0)
+    return torch.where(deepest <= limit, 1.0, left + (1 - left) * share)
+
+
+def beyond_the_limit(c: TaskConfig) -> str:
+    """What `without_overlap` does above the limit, for the end of a sentence about a term; nothing if all at once."""
+    most = 1000 * c.penetration_limit * (1 + c.overlap_grace)
+    return f", falling up to {most:g} mm" if c.overlap_grace > 0 else ""
 
 
 def penalties(weights: Any, free: float, limit: float, most: float = 1.0) -> dict[str, Term[Any]]:

@@ -21,6 +21,7 @@ from dora.tasks.mdp.snapshot import Snapshot, derived
 from dora.tasks.mdp.stages import Stage
 from dora.tasks.mdp.terms import (
     at_candidate,
+    beyond_the_limit,
     finger_contacts,
     near_region,
     paper_affordance,
@@ -28,6 +29,7 @@ from dora.tasks.mdp.terms import (
     paper_penalty,
     penalties,
     while_active,
+    without_overlap,
 )
 from dora.tasks.microwave.reference import OpenSettings, PlaceSettings
 from dora.tasks.microwave.snapshot import (
@@ -228,20 +230,18 @@ def terms(c: MicrowaveConfig) -> Terms[MicrowaveSnapshot]:
     def door(s: MicrowaveSnapshot) -> Tensor:
         return (s.door / c.open).clamp(0, 1) * (s.stage >= MOVE)
 
-    def clean(s: MicrowaveSnapshot, left: float = c.after_overlap) -> Tensor:
-        return torch.where(s.max_penetration <= c.penetration_limit, 1.0, left)
-
     def carry(s: MicrowaveSnapshot) -> Tensor:
         return (0.3 * rise(s, c.lift) + 0.7 * _before(s, c)) * (0.3 + 0.7 * opposed(s).float())
 
     def carried(s: MicrowaveSnapshot) -> Tensor:
-        return while_active(MOVE, carry)(s) * clean(s)
+        return while_active(MOVE, carry)(s) * without_overlap(s, c, c.after_overlap)
 
     def put(s: MicrowaveSnapshot) -> Tensor:
-        return torch.where(inside(s), 1.0, 0.8 * _depth(s, c)) * (s.stage >= PUT) * clean(s)
+        depth = torch.where(inside(s), 1.0, 0.8 * _depth(s, c)) * (s.stage >= PUT)
+        return depth * without_overlap(s, c, c.after_overlap)
 
     def placed(s: MicrowaveSnapshot) -> Tensor:
-        return at_rest(s.of(RIGHT), c).float() * clean(s, c.placed_after_overlap)
+        return at_rest(s.of(RIGHT), c) * without_overlap(s, c, c.placed_after_overlap)
 
     return Terms(
         {
@@ -250,7 +250,7 @@ def terms(c: MicrowaveConfig) -> Terms[MicrowaveSnapshot]:
             "carry": Term(
                 seen_by(RIGHT, carried), w.carry,
                 doc="rise of the cube and closeness to the place before the cavity, held by thumb and finger; less "
-                "after an overlap above the limit",
+                f"after an overlap above the limit{beyond_the_limit(c)}",
             ),
             "put": Term(
                 seen_by(RIGHT, put), w.put, doc="depth of the cube in the cavity; 1 inside, less after an overlap"
@@ -258,7 +258,7 @@ def terms(c: MicrowaveConfig) -> Terms[MicrowaveSnapshot]:
             "placed": Term(
                 placed, w.placed,
                 doc="the cube lies inside, hand out, door open; "
-                f"{c.placed_after_overlap:g} of it after an overlap above the limit",
+                f"{c.placed_after_overlap:g} of it after an overlap above the limit{beyond_the_limit(c)}",
             ),
             **penalties(w, c.free_overlap, c.penetration_limit, c.overlap_range),
         }
