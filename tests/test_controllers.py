@@ -8,7 +8,7 @@ import torch
 
 import dora.tasks as tasks
 from dora.geometry.rotations import quaternion_from_rotation_vector, quaternion_multiply, rotation_angle
-from dora.sim.controllers import LIMIT_MARGIN
+from dora.sim.controllers import LIMIT_MARGIN, WRIST_SPEED, WRIST_SPIN
 from dora.tasks.env.env import DoraEnv
 from dora.tasks.guidance.residual_action import wrist_step
 
@@ -87,17 +87,28 @@ def test_hand_targets_reach_what_was_asked_no_faster_than_allowed(task: DoraEnv)
     torch.testing.assert_close(controller.target[0, 7:], torch.tensor(hand.upper, dtype=torch.float32))
 
 
-def test_finger_commands_move_no_faster_than_their_share_and_the_drives_push_no_more():
+def test_commands_move_no_faster_than_their_share_and_the_drives_push_no_more():
     task = tasks.make_task(
-        "DoraCube-v1", 1, "none", preset="none", config={"hand_speed": 0.25, "arm_effort": 0.5, "hand_effort": 0.2}
+        "DoraCube-v1",
+        1,
+        "none",
+        preset="none",
+        config={"hand_speed": 0.25, "arm_effort": 0.5, "hand_effort": 0.2, "wrist_speed": 0.1},
     )
     task.reset(seed=0)
     controller, robot = task.agent.wrist_controller, task.agent.description
     before = controller.target[:, 7:].clone()
     action = torch.ones(1, task.action_size)
-    action[:, :6] = 0.0
+    action[:, :6] = torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0, -1.0])
+    assert controller.wrist_limits == pytest.approx(
+        (0.1 * WRIST_SPEED * controller.dt, 0.1 * WRIST_SPIN * controller.dt)
+    )
+    p, q = controller.wrist()
     for _ in range(2):
         task.step(action)
+    moved, turned = controller.wrist()[0] - p, rotation_angle(controller.wrist()[1], q)
+    torch.testing.assert_close(moved, torch.tensor([[0.0, 0.0, 0.2 * WRIST_SPEED * controller.dt]]), atol=5e-4, rtol=0)
+    torch.testing.assert_close(turned, torch.tensor([0.2 * WRIST_SPIN * controller.dt]), atol=1e-3, rtol=0)
     share = torch.tensor(robot.hand.velocity, dtype=torch.float32) * controller.dt / 4
     expected = torch.minimum(before + 2 * share, controller.hand_upper)
     torch.testing.assert_close(controller.target[:, 7:], expected)

@@ -182,7 +182,7 @@ def test_masses_are_nominal_times_a_share_or_from_empty_to_full():
 TAKEN: list[dict[str, Any]] = [
     {"randomisation": {"size": 0.99}}, {"randomisation": {"friction": [0.0, 0.0]}}, {"randomisation": {"delay": 1000}},
     {"control_frequency": 1, "physics_frequency": 1}, {"arm_effort": 0.01}, {"pose_filter": 0.01},
-    {"hand_speed": 0.01}, {"hand_speed": 1.0}, {"hand_effort": 0.01}, {"overlap_grace": 0.0},
+    {"hand_speed": 0.01}, {"hand_speed": 1.0}, {"hand_effort": 0.01}, {"wrist_speed": 0.01}, {"overlap_grace": 0.0},
     {"solver_iterations": 255}, {"control_frequency": 50},
 ]  # fmt: skip
 REFUSED: list[tuple[dict[str, Any], str]] = [
@@ -195,7 +195,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"solver_iterations": 256}, "solver_iterations"), ({"control_frequency": 0}, "control_frequency"),
     ({"residual": {"position": -0.1}}, "residual"), ({"hold_time": -0.1}, "hold_time"),
     ({"hand_speed": 0.009}, "hand_speed"), ({"hand_speed": 1.01}, "hand_speed"),
-    ({"hand_effort": 1.01}, "hand_effort"), ({"overlap_grace": -0.1}, "overlap_grace"),
+    ({"hand_effort": 1.01}, "hand_effort"), ({"wrist_speed": 0.0}, "wrist_speed"),
+    ({"overlap_grace": -0.1}, "overlap_grace"),
 ]  # fmt: skip
 
 

@@ -72,6 +72,8 @@ class WristHandController(BaseController):
     sets_target_qvel = False
     efforts = 1.0, 1.0
     """Shares of their torque limits with which the drives of arm and hand work."""
+    wrist_speed = 1.0
+    """Share of the speeds of `set_motion` at which a full action moves the wrist."""
     hand_speed = 1.0
     """Share of their velocity limits at which commands of finger joints move."""
 
@@ -108,23 +110,29 @@ class WristHandController(BaseController):
             spin: angular speed about one axis [rad/s].
             feed_forward: the velocity of the commanded joints becomes the drives' velocity target.
         """
-        self.wrist_limits = (speed * self.dt, spin * self.dt)
-        """Translation [m] and rotation [rad] of a full action in one control step."""
-        self.wrist_scale = torch.tensor([speed] * 3 + [spin] * 3, device=self.device) * self.dt
-        self.feed_forward = feed_forward
+        self._motion, self.feed_forward = (speed, spin), feed_forward
+        self._scale_motion()
 
-    def limit(self, arm_effort: float, hand_effort: float, hand_speed: float) -> None:
+    def _scale_motion(self) -> None:
+        speed, spin = (self.wrist_speed * self.dt * full for full in self._motion)
+        self.wrist_limits = (speed, spin)
+        """Translation [m] and rotation [rad] of a full action in one control step."""
+        self.wrist_scale = torch.tensor([speed] * 3 + [spin] * 3, device=self.device)
+
+    def limit(self, arm_effort: float, hand_effort: float, wrist_speed: float, hand_speed: float) -> None:
         """Makes arm and hand gentler where they meet something.
 
         Args:
             arm_effort: share of their torque limits that the drives of the arm get. The motion of the free arm needs
                 little of them: it is bounded by its speed, not by its torques.
             hand_effort: the same of the hand. At 1 a finger presses with about 10 N at its tip.
+            wrist_speed: share of the speeds of `set_motion` at which a full action moves the wrist.
             hand_speed: share of the finger joints' velocity limits at which their commands move. At 1 a fingertip
                 closes at about 1 m/s and hits what it closes around.
         """
-        self.efforts, self.hand_speed = (arm_effort, hand_effort), hand_speed
+        self.efforts, self.wrist_speed, self.hand_speed = (arm_effort, hand_effort), wrist_speed, hand_speed
         self.set_drive_property()
+        self._scale_motion()
 
     @property
     def hand_size(self) -> int:

@@ -132,11 +132,11 @@ class DoraEnv(BaseEnv):
     def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
         poses: Any = [sapien.Pose(arm.position, arm.quaternion) for arm in self.task.ARMS.values()]
         super()._load_agent(options, poses)
-        for agent in getattr(self.agent, "agents", [self.agent]):
-            if agent.commands_wrist:
-                agent.wrist_controller.limit(self.config.arm_effort, self.config.hand_effort, self.config.hand_speed)
-                if self.task.WRIST_MOTION is not None:
-                    agent.wrist_controller.set_motion(*self.task.WRIST_MOTION, feed_forward=True)
+        c, agents = self.config, getattr(self.agent, "agents", [self.agent])
+        for controller in [agent.wrist_controller for agent in agents if agent.commands_wrist]:
+            controller.limit(c.arm_effort, c.hand_effort, c.wrist_speed, c.hand_speed)
+            if self.task.WRIST_MOTION is not None:
+                controller.set_motion(*self.task.WRIST_MOTION, feed_forward=True)
 
     def _load_scene(self, options: dict) -> None:
         task, names = self.task, tuple(dict.fromkeys(arm.object for arm in self.task.ARMS.values()))

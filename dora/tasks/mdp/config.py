@@ -53,6 +53,8 @@ class TaskConfig:
     """Share of their torque limits with which the drives of an arm work; control modes of joints ignore it [1]."""
     hand_effort: float = 1.0
     """Share of their torque limits with which the drives of a hand work; control modes of joints ignore it [1]."""
+    wrist_speed: float = 1.0
+    """Share of its usual speed at which a full action moves a wrist; control modes of joints ignore it [1]."""
     hand_speed: float = 1.0
     """Share of their velocity limits at which commands of finger joints move; control modes of joints ignore it [1]."""
     pose_filter: float = 1.0
