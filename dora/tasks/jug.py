@@ -151,7 +151,7 @@ class JugTask(Task):
         },
         "ppo": {
             "total_steps": 600_000, "stop_success": 0.99, "num_envs": 64, "eval_every": 60_000, "eval_episodes": 100,
-            "eval_envs": 50, "learner": {"rollout": 16, "log_std": -1.8},
+            "eval_envs": 50, "learner": {"rollout": 64, "log_std": -1.8},
         },
     }  # fmt: skip
 
