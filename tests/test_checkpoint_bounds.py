@@ -95,11 +95,18 @@ def test_hidden_layers_are_as_wide_as_a_checkpoint_can_hold(settings: PPOConfig 
 
 
 def test_the_smaller_of_two_settings_may_equal_the_larger():
-    for fits in (PPOConfig(learning_rate_min=1e-3), PPOConfig(log_std_min=-0.7)):
+    for fits in (
+        PPOConfig(learning_rate_min=1e-3),
+        PPOConfig(log_std_min=-0.7),
+        PPOConfig(log_std_last=-0.7),
+        PPOConfig(log_std_last=-3.0),
+    ):
         check(dataclasses.replace(CONFIG, learner=fits))
     for wrong, words in (
         (PPOConfig(learning_rate_min=1.1e-3), "learning-rate-min"),
         (PPOConfig(log_std_min=-0.6), "log-std-min"),
+        (PPOConfig(log_std_last=-0.6), "log-std-last"),
+        (PPOConfig(log_std_last=-3.1), "log-std-min"),
     ):
         with pytest.raises(InputError, match=f"{words} is .*: the first has to be the smaller one"):
             check(dataclasses.replace(CONFIG, learner=wrong))

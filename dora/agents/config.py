@@ -66,6 +66,10 @@ class PPOConfig:
     """First logarithm of the exploration noise, in units of the action range's half width."""
     log_std_min: float = -3.0
     """Smallest logarithm of the exploration noise."""
+    log_std_last: float | None = None
+    """Largest one from `log_std_steps` on, to which that falls evenly from `log_std`; None: 0 throughout."""
+    log_std_steps: int = 1_000_000
+    """Environment steps after which `log_std_last` is reached."""
     noise_correlation: float = 0.0
     """Correlation of the exploration noise of successive steps, in [0, 1)."""
     hidden: tuple[int, ...] = (256, 128)
@@ -144,7 +148,12 @@ UNUSED = {"reward": "dense", "after_success": None, "overlap_share": 1.0, "overl
 """The same of settings of the run."""
 CONSTANT_PULL = {"prior_last": None, "prior_steps": 100_000}
 """Settings of a pull that does not change."""
-NEUTRAL_LEARNER = {name: {"prior": 0.0, **CONSTANT_PULL} for name in ("ppo", "mappo", "happo")} | {"sac": CONSTANT_PULL}
+CONSTANT_NOISE = {"log_std_last": None, "log_std_steps": 1_000_000}
+"""Settings of noise that no schedule bounds."""
+NEUTRAL_LEARNER = {
+    **{name: {"prior": 0.0, **CONSTANT_PULL, **CONSTANT_NOISE} for name in ("ppo", "mappo", "happo")},
+    "sac": CONSTANT_PULL,
+}
 """The same of settings of each learner."""
 DIGITS = 12
 """Hexadecimal digits of a digest of settings."""

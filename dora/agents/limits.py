@@ -70,12 +70,17 @@ LEARNER = {
     "target_entropy": (-1e6, 1e6),
     "log_std": (-30, 0),  # PPO's noise never grows beyond the range of actions
     "log_std_min": (-30, 0),
+    "log_std_last": (-30, 0),
+    "log_std_steps": (1, 10**12),
     "log_std_max": (-30, 10),
 }
 """Lowest and highest value of the settings of learners."""
 EARLIER = {"final_episodes": (1, 10**6), "eval_episodes": (1, 100_000), "log_std": (-30, 10), "log_std_min": (-30, 10)}
 """Wider ranges of earlier versions, whose files can be read still."""
-ORDERED = (("learning_rate_min", "learning_rate_max"), ("log_std_min", "log_std"))
+ORDERED = (
+    ("learning_rate_min", "learning_rate_max"), ("log_std_min", "log_std"), ("log_std_last", "log_std"),
+    ("log_std_min", "log_std_last"),
+)  # fmt: skip
 """Settings of learners of which the first may not be larger than the second."""
 FLAGS = {"final_episodes": "episodes"}
 """Options whose name is not that of their setting."""

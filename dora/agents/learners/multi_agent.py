@@ -25,7 +25,7 @@ from dora.agents.config import HAPPOConfig, MAPPOConfig, PPOConfig
 from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, GaussianActor, JointActor, LatestOutput, Normaliser, Policy, for_loss
 from dora.agents.learners.ppo import ADAM_EPSILON, adapted, excess, squared, standardised, transitions
-from dora.agents.learners.pull import pull
+from dora.agents.learners.schedules import loudest, pull
 from dora.agents.learners.stopping import Stop, never
 
 Passes = Sequence[Int[Tensor, " b"]]
@@ -92,7 +92,7 @@ class MultiAgentPPO:
             return {}
         self.steps += batch.numel()
         for one in self.updates.values():
-            one.prior = pull(self.config, self.steps)
+            one.prior, one.loudest = pull(self.config, self.steps), loudest(self.config, self.steps)
         data = transitions(batch, self.normaliser, self.critic, self.config)
         advantage = standardised(data["advantage"])
         passes = [torch.randperm(len(data)) for _ in range(self.config.epochs)]
@@ -146,7 +146,8 @@ class AgentUpdate:
     """
 
     def __init__(self, name: str, policy: ProbabilisticTensorDictSequential, config: PPOConfig):
-        self.name, self.policy, self.config, self.prior = name, policy, config, config.prior
+        self.name, self.policy, self.config = name, policy, config
+        self.prior, self.loudest = pull(config, 0.0), loudest(config, 0.0)
         self.loss = ClipPPOLoss(
             policy,
             None,
@@ -207,7 +208,7 @@ class AgentUpdate:
         norm = _descend(self.optimiser, total, parameters, self.config.grad_norm, f"actor of {self.name}")
         if self._gaussian is not None:
             with torch.no_grad():
-                self._gaussian.log_std.clamp_(self.config.log_std_min, 0.0)
+                self._gaussian.log_std.clamp_(self.config.log_std_min, self.loudest)
         values = [out["loss_objective"], out["entropy"].mean(), bound, out["clip_fraction"].mean(), norm]
         correction = self._latest.mean.detach().square().mean().sqrt()
         values += [correction.nan_to_num()]  # without a mean: it is another distribution

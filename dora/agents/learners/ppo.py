@@ -12,7 +12,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from dora.agents.config import PPOConfig
 from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, GaussianActor, LatestOutput, Normaliser, Policy, for_loss
-from dora.agents.learners.pull import pull
+from dora.agents.learners.schedules import loudest, pull
 from dora.agents.learners.stopping import Stop, never
 
 ADAM_EPSILON = 1e-8
@@ -134,7 +134,7 @@ class PPO:
         check_loss("gradient of the critic", critic_norm)
         self.optimiser.step()
         with torch.no_grad():
-            self.actor.log_std.clamp_(self.config.log_std_min, 0.0)
+            self.actor.log_std.clamp_(self.config.log_std_min, loudest(self.config, self.steps))
         names = ("loss_objective", "loss_critic", "entropy")
         values = [out[name].mean() for name in names] + [bound, out["clip_fraction"].mean(), norm]
         values += [self._latest.mean.detach().square().mean().sqrt()]

@@ -13,8 +13,8 @@ from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 from dora.agents.config import SACConfig
 from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, LatestOutput, Normaliser, Policy, TanhActor, for_loss
-from dora.agents.learners.pull import pull
 from dora.agents.learners.replay import Replay
+from dora.agents.learners.schedules import pull
 from dora.agents.learners.stopping import Stop, never
 
 ACTOR_PERIOD = 2

@@ -1,4 +1,4 @@
-"""The pull of mean actions towards no correction, over the course of a run."""
+"""The pull of mean actions towards no correction, and the ceiling of the noise, over the course of a run."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from test_agents_multi import SETTINGS, SIZES, batch_of, learner_of
 from dora.agents.config import PPOConfig, SACConfig
 from dora.agents.learners.networks import last_layer
 from dora.agents.learners.ppo import PPO
-from dora.agents.learners.pull import pull
+from dora.agents.learners.schedules import loudest, pull
 from dora.agents.runs.recommended import recommended
 
 
@@ -62,6 +62,28 @@ def test_the_pull_of_ppo_and_of_each_agent_falls_with_the_steps_and_is_resumed()
     assert other.steps == learner.steps == batch.numel()
     other.set_counters({})  # of a version that did not count
     assert other.steps == 0
+
+
+def test_the_ceiling_of_the_noise_falls_evenly_with_the_steps():
+    config = PPOConfig(log_std=-0.7, log_std_last=-1.7, log_std_steps=1000)
+    assert [loudest(config, steps) for steps in (0.0, 500.0, 1000.0, 5000.0)] == pytest.approx([-0.7, -1.2, -1.7, -1.7])
+    assert loudest(PPOConfig(log_std=-0.7), 5000.0) == 0.0
+
+
+def test_the_noise_of_ppo_and_of_each_agent_stays_below_its_ceiling():
+    """However much the bonus for entropy asks for more; twice the steps that the first batch has."""
+    settings = {**SETTINGS, "entropy": 1.0, "log_std": -0.7, "log_std_last": -1.7}
+    count = batch_of(PPO(PPOConfig(**SETTINGS), *SIZES, 1000)).numel()
+    for steps, ceiling in ((2 * count, -1.2), (1, -1.7)):
+        ppo = PPO(PPOConfig(**settings, log_std_steps=steps), *SIZES, 1000)
+        learner = learner_of(**settings, log_std_steps=steps)
+        for one in (ppo, learner):
+            one.update(batch_of(one))
+        for actor in (ppo.actor, *(learner.actor.actors[name] for name in learner.agents)):
+            torch.testing.assert_close(actor.log_std, torch.full_like(actor.log_std, ceiling))
+    free = PPO(PPOConfig(**{**settings, "log_std_last": None}), *SIZES, 1000)
+    free.update(batch_of(free))
+    assert free.actor.log_std.min() > -0.71
 
 
 def test_a_preset_may_have_settings_of_its_own():
