@@ -163,6 +163,11 @@ def test_names_of_films_and_checkpoints(tmp_path: Path):
         check_film(tmp_path / "a.mp4")
     assert checkpoint_path(tmp_path) == tmp_path / "checkpoints" / "best.safetensors"
     assert checkpoint_path(tmp_path / "b.safetensors") == tmp_path / "b.safetensors"
+    (tmp_path / "policy.safetensors").touch()  # beside a stored result
+    assert checkpoint_path(tmp_path) == tmp_path / "policy.safetensors"
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "best.safetensors").touch()
+    assert checkpoint_path(tmp_path) == tmp_path / "checkpoints" / "best.safetensors"
 
 
 # --------------------------------------------------------------------- environment

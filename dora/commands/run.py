@@ -2,6 +2,7 @@
 
     dora run --env DoraCube-v1
     dora run --env DoraCube-v1 --task.lift 0.12 --learner.gamma 0.97
+    dora run --like results/tasks/DoraJug-v1/sac-affordance-s10 --seed 1
     dora run --eval-only --checkpoint FOLDER --seed 1 --episodes 50 --video
     dora run --eval-only --zero-correction --env DoraCube-v1
 
@@ -48,7 +49,7 @@ VIDEO_EPISODES = 3
 """Episodes of a film [1]."""
 ZERO = "zero"
 """Name of the agent that evaluates as zero correction."""
-ENTRANCES = ("--env", "--eval-only", "--checkpoint", "--resume")
+ENTRANCES = ("--env", "--eval-only", "--checkpoint", "--resume", "--like")
 """Options that say what is run."""
 OF_TRAINING = (
     "env", "agent", "learner", "total_steps", "eval_every", "eval_episodes", "stop_success", "checkpoint_seconds",
@@ -71,12 +72,14 @@ class Args(Generic[Numbers, Settings, Agent]):
     """Run folder to make (default runs/<env>/<agent>-<guidance>-s<seed>-<time>)."""
     resume: Path | None = None
     """Run folder to go on with, from its last checkpoint; only --total-steps may differ."""
+    like: Path | None = None
+    """Run folder, folder of a stored result or checkpoint whose settings are the defaults of a new run."""
     eval_only: bool = False
     """Evaluate --checkpoint, or with --zero-correction alone the zero action of --env, instead of training."""
     zero_correction: bool = True
     """Evaluate the zero action, too, where it is that of a reference (default with --eval-only: no)."""
     checkpoint: Path | None = None
-    """Checkpoint to evaluate: a .safetensors file, or a run folder for its best one."""
+    """Checkpoint to evaluate: a .safetensors file, a run folder for its best one, or a folder of a stored result."""
     collector: Literal["processes", "ray"] = "processes"
     """Where workers collect: in processes of this machine, or in actors of the Ray cluster at RAY_ADDRESS, one core
     each (without that variable, of one on this machine alone; needs `pip install ray`)."""
@@ -92,6 +95,7 @@ class First:
 
     env: str | None = None
     resume: Path | None = None
+    like: Path | None = None
     checkpoint: Path | None = None
     out: Path | None = None
     eval_only: bool = False
@@ -118,7 +122,7 @@ def parse(words: Sequence[str]) -> Args[dict[str, Any], Any, str]:
     default = Args(run=replace(base, task=numbers), zero_correction=not first.eval_only)
     args = tyro.cli(form, default=default, description=__doc__, args=list(words))
     numbers = task_config(task.CONFIG, args.run.preset, args.run.task)
-    if args.eval_only:  # by the rules of now, whichever the policy was trained by
+    if args.eval_only or args.like is not None:  # by the rules of now, whichever the policy was trained by
         numbers = replace(numbers, definition=task_config(task.CONFIG, args.run.preset, None).definition)
     config = replace(args.run, task=plain(numbers))
     check(config, stored=first.resume is not None or first.checkpoint is not None)
@@ -145,7 +149,7 @@ def settings_to_start_from(first: First, words: Sequence[str]) -> RunConfig:
     """
     if first.resume is not None:
         given = {"--out": first.out, "--checkpoint": first.checkpoint, "--eval-only": first.eval_only or None}
-        for option, value in given.items():
+        for option, value in (given | {"--like": first.like}).items():
             if value is not None:
                 raise InputError(f"{option} does not go with --resume, which goes on in its folder: leave it out.")
         RunFolder(first.resume).check_trained()
@@ -155,6 +159,8 @@ def settings_to_start_from(first: First, words: Sequence[str]) -> RunConfig:
         find_preset(preset)
     guidance_in_force(first.guidance or "affordance", None)
     guidance_in_force("affordance", first.guidance_parts)
+    if first.like is not None:
+        return settings_like(first, first.like)
     if first.eval_only and first.checkpoint is None and not (first.zero_correction and first.env is not None):
         raise InputError(
             "--eval-only needs --checkpoint with a .safetensors file or a run folder, or --zero-correction with --env."
@@ -174,6 +180,40 @@ def settings_to_start_from(first: First, words: Sequence[str]) -> RunConfig:
     env = first.env or SHOWN
     choice: Any = {"guidance": first.guidance, "guidance_parts": first.guidance_parts, "preset": preset}
     return recommended(env, first.agent, find_task(env).LEARNERS, **choice)
+
+
+def settings_like(first: First, path: Path) -> RunConfig:
+    """Settings of an earlier run, under the preset that is asked for.
+
+    Args:
+        first: options of the new run.
+        path: run folder, folder of a stored result, or checkpoint of the earlier one.
+
+    Raises:
+        InputError: it is none, or the new run is to be of another task, learner or kind of action.
+    """
+    for option, value in {"--checkpoint": first.checkpoint, "--eval-only": first.eval_only or None}.items():
+        if value is not None:
+            raise InputError(f"{option} does not go with --like, which begins a training: leave one of them out.")
+    of_run = os.path.isfile(path / "config.yaml")
+    config = RunFolder(path).read_config() if of_run else read_checkpoint(checkpoint_path(path)).config
+    for name in ("env", "agent"):
+        theirs, asked = getattr(config, name), getattr(first, name)
+        if asked is not None and asked != theirs:
+            raise InputError(
+                f"--{name} is {asked}, and the settings of {path} are for {theirs}: leave one of them out."
+            )
+    guidance = config.guidance if first.guidance is None else first.guidance
+    parts = config.guidance_parts if first.guidance_parts is None else first.guidance_parts
+    if replace(config, guidance=guidance, guidance_parts=parts).has_prior != config.has_prior:
+        kind = "corrections of a reference" if config.has_prior else "actions without a reference"
+        raise InputError(
+            f"The settings of {path} are for {kind}: leave --guidance and --guidance-parts out, or begin with --env."
+        )
+    if first.preset is None:
+        return config
+    numbers = numbers_under_preset(find_task(config.env).CONFIG, config.task, config.preset, first.preset)
+    return replace(config, preset=first.preset, task=numbers)
 
 
 def refuse_settings_of_training(base: RunConfig, asked: RunConfig) -> None:

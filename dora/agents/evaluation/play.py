@@ -28,8 +28,11 @@ FRAMES_PER_SECOND = 20
 
 
 def checkpoint_path(path: Path) -> Path:
-    """The file meant by `path`: itself, or the best checkpoint of a run folder."""
-    return path / "checkpoints" / "best.safetensors" if os.path.isdir(path) else path
+    """The file meant by `path`: itself, the best checkpoint of a run folder, or the policy beside a stored result."""
+    if not os.path.isdir(path):
+        return path
+    best, stored = path / "checkpoints" / "best.safetensors", path / "policy.safetensors"
+    return stored if os.path.isfile(stored) and not os.path.isfile(best) else best
 
 
 def load_policy(checkpoint: Checkpoint, path: Path) -> Policy:
