@@ -65,6 +65,14 @@ def test_a_run_folder_and_a_checkpoint_have_settings_too(tmp_path: Path):
         of(tmp_path)
 
 
+def test_a_run_of_earlier_rules_is_trained_anew_by_those_of_now(tmp_path: Path):
+    config = of(RESULTS / "DoraHammer-v1" / "sac-affordance-s10").run
+    assert config.task["definition"] > 1
+    folder = RunFolder(tmp_path / "run")
+    folder.create(dataclasses.replace(config, task=config.task | {"definition": 1}))
+    assert of(folder.path).run == config
+
+
 @pytest.mark.parametrize(
     ("more", "words"),
     [
