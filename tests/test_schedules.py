@@ -79,7 +79,7 @@ def test_the_noise_of_ppo_and_of_each_agent_stays_below_its_ceiling():
         learner = learner_of(**settings, log_std_steps=steps)
         for one in (ppo, learner):
             one.update(batch_of(one))
-        for actor in (ppo.actor, *(learner.actor.actors[name] for name in learner.agents)):
+        for actor in (ppo.actor, *map(learner.actor.of, learner.agents)):
             torch.testing.assert_close(actor.log_std, torch.full_like(actor.log_std, ceiling))
     free = PPO(PPOConfig(**{**settings, "log_std_last": None}), *SIZES, 1000)
     free.update(batch_of(free))
