@@ -74,8 +74,6 @@ class WristHandController(BaseController):
     """Shares of their torque limits with which the drives of arm and hand work."""
     wrist_speed = 1.0
     """Share of the speeds of `set_motion` at which a full action moves the wrist."""
-    hand_speed = 1.0
-    """Share of their velocity limits at which commands of finger joints move."""
 
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
@@ -125,12 +123,13 @@ class WristHandController(BaseController):
         Args:
             arm_effort: share of their torque limits that the drives of the arm get. The motion of the free arm needs
                 little of them: it is bounded by its speed, not by its torques.
-            hand_effort: the same of the hand. At 1 a finger presses with about 10 N at its tip.
+            hand_effort: the same of the hand.
             wrist_speed: share of the speeds of `set_motion` at which a full action moves the wrist.
-            hand_speed: share of the finger joints' velocity limits at which their commands move. At 1 a fingertip
-                closes at about 1 m/s and hits what it closes around.
+            hand_speed: share of the finger joints' velocity limits at which their commands move.
         """
-        self.efforts, self.wrist_speed, self.hand_speed = (arm_effort, hand_effort), wrist_speed, hand_speed
+        self.efforts, self.wrist_speed = (arm_effort, hand_effort), wrist_speed
+        full = torch.tensor(self.config.robot.hand.velocity, dtype=torch.float32, device=self.device) * self.dt
+        self.hand_step = hand_speed * full
         self.set_drive_property()
         self._scale_motion()
 
@@ -236,8 +235,7 @@ class WristHandController(BaseController):
         arm = torch.clamp(arm, self.arm_lower, self.arm_upper)
         share = self.expand_hand(action[:, 6:]) / 2 + 0.5
         wanted = self.hand_lower + share * (self.hand_upper - self.hand_lower)
-        step = self.hand_speed * self.hand_step
-        hand = hand + torch.clamp(wanted - hand, -step, step)
+        hand = hand + torch.clamp(wanted - hand, -self.hand_step, self.hand_step)
         if self.feed_forward:
             self._tell_velocity((arm - self.target[:, : self.arm_size]) / self.dt)
         self.target = torch.cat([arm, hand], -1)
