@@ -8,6 +8,7 @@ import pytest
 
 from dora.agents.reports.comparison import of_the_paper, sections, with_interval
 from dora.agents.reports.failures import failure_kinds
+from dora.agents.reports.figures import draw_overlap
 from dora.agents.reports.paper import PAPER
 from dora.agents.reports.run_results import Run
 
@@ -166,3 +167,27 @@ def test_failures_are_shares_of_all_episodes_and_the_most_frequent_comes_first()
     assert [row[4] for row in rows([*runs, made()], "Why episodes fail")] == [text]
     assert [row[4] for row in rows([made(episodes=of(1, 1))], "Why episodes fail")] == ["none"]
     assert rows([made()], "Why episodes fail") == []
+
+
+def test_the_figure_of_overlap_has_zero_correction_once_for_the_learners_that_share_it(monkeypatch: pytest.MonkeyPatch):
+    from matplotlib import pyplot
+
+    figures: list[Any] = []
+    monkeypatch.setattr(pyplot, "close", figures.append)
+    shared, other = {"penetration_mm": np.array([3.0, 1.0, 2.0])}, {"penetration_mm": np.array([7.0, 6.0])}
+    learned = {"penetration_mm": np.array([0.5, 4.0])}
+    runs = [
+        made(agent="ppo", episodes=learned, zero=shared),
+        made(agent="sac", episodes=learned, zero=shared),
+        made("grasps", agent="sac", episodes=learned, zero=other),
+        made(agent="sac", env="DoraCube-v1", episodes=learned, zero={"penetration_mm": np.array([9.0])}),
+    ]
+    assert draw_overlap(runs, "DoraJug-v1", "standard").startswith(b"\x89PNG")
+    (figure,) = figures
+    dotted = {
+        line.get_label(): line.get_xdata().tolist() for line in figure.axes[0].lines if line.get_linestyle() == ":"
+    }
+    assert sorted(dotted.values()) == [[1.0, 2.0, 3.0], [6.0, 7.0]]
+    assert [name.split(", guidance ")[0] for name in dotted] == ["PPO", "SAC"]
+    assert all(name.endswith(", zero correction") for name in dotted)
+    assert len(figure.axes[0].lines) == 5
