@@ -187,7 +187,13 @@ def test_unknown_objects_are_refused_with_what_there_is(name: str, words: str):
 
 def test_grasps_lie_in_the_objects_folder(folder: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("DORA_OBJECTS", str(folder.parent))
-    with pytest.raises(InputError, match=r"has no grasps .*--object box --make-bundle"):
+    for task, words in {
+        None: "--object box --make-bundle",
+        "DoraTwo-v1": "other object of DoraTwo-v1, .*--rank",
+    }.items():
+        with pytest.raises(InputError, match=f"has no grasps .*{words}.*-any-region"):
+            load_candidates("box", region=False, task=task)
+    with pytest.raises(InputError, match=r"has no grasps .*--object box --make-bundle`"):
         load_candidates("box")
     box = load_object("box")
     made = replace(load_candidates("cube").select([0, 1]), object="box", digest=box.digest)

@@ -76,8 +76,10 @@ def load_candidates(
     path = bundled_path(name, region, task)
     if not os.path.isfile(path):
         option = "" if region else " --any-region"
-        raise InputError(
-            f"the object {str(name)!r} has no grasps ({path}): "
-            f"make them with `dora grasps --object {name} --make-bundle{option}`."
-        )
+        if task is None:
+            how = f"make them with `dora grasps --object {name} --make-bundle{option}`"
+        else:
+            ranking = f"dora grasps --object ... --rank-in-task{option}"
+            how = f"they are made with those of the other object of {task}, by `{ranking}`"
+        raise InputError(f"the object {str(name)!r} has no grasps ({path}): {how}.")
     return GraspCandidates.load(path, load_object(name), robot or load_robot(ROBOT))
