@@ -22,8 +22,6 @@ AFFORDANCE, GRASPS, NONE, PAPERS = ("affordance", None), ("grasps", None), ("non
 """The kinds of guidance that are compared."""
 ONE_ARM = {"DoraCube-v1": 300_000, "DoraJug-v1": 300_000, "DoraHammer-v1": 300_000}
 """Environment steps of a run of each task of one arm, the same for all learners."""
-WITH_ANY_REGION = {name: steps for name, steps in ONE_ARM.items() if name != "DoraHammer-v1"}
-"""Those with candidates of a search that knows no region; the hammer has none."""
 TWO_ARMS = {"DoraMicrowave-v1": 400_000}
 """The same of tasks of two arms."""
 
@@ -67,8 +65,7 @@ PRESETS = {
         (
             Block("Table II", ONE_ARM, ("ppo", "sac"), (AFFORDANCE, NONE)),
             Block("Table IV", TWO_ARMS, ("happo", "mappo"), (AFFORDANCE, NONE)),
-            Block("ladder", WITH_ANY_REGION, (None,), (GRASPS,)),
-            Block("ladder", ONE_ARM, (None,), (PAPERS,)),
+            Block("ladder", ONE_ARM, (None,), (GRASPS, PAPERS)),
         ),
         seeds=(10, 11, 12),
         episodes=500,
