@@ -11,7 +11,7 @@ a policy falls short of the third, it is the learner, or what the policy observe
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dora.errors import InputError, command
+from dora.geometry.poses import relative
 from dora.progress import ProgressDisplay
 from dora.tables import share_text, text_table
 from dora.tasks import make_task
@@ -47,6 +48,8 @@ class Args:
     """How much episodes are randomised."""
     guidance: Literal["affordance", "grasps"] = "affordance"
     """Where candidates come from: a search in the regions of the object, or one that knows no region."""
+    misplaced: Literal["candidates", "object"] = "candidates"
+    """What is off by the candidates' error: they, or the measured pose of their object."""
     pose_filter: float | None = None
     """Share of the newest measurement in the estimated pose of an object, 1: no filter; the task's own if not given."""
 
@@ -71,7 +74,9 @@ def exact_action(task: DoraEnv) -> Float[Tensor, "n a"]:
     parts = []
     for arm in task.arms.values():
         bounds, expand = arm.guide.residual.bounds, arm.agent.wrist_controller.expand_hand
-        parts.append(exact_correction(arm.guide.choice, bounds, expand, arm.action_size - 6))
+        pose = task.objects[arm.spec.object].pose
+        frame = relative(task.perturbations.biased(arm.name, (pose.p, pose.q)), (pose.p, pose.q))
+        parts.append(exact_correction(arm.guide.choice, bounds, expand, arm.action_size - 6, frame))
     return torch.cat(parts, -1)
 
 
@@ -87,7 +92,8 @@ def outcome(args: Args, act: Act, error: float, report: Callable[[int, int], obj
     Raises:
         InputError: there is no such task.
     """
-    changed = {} if args.pose_filter is None else {"pose_filter": args.pose_filter}
+    changed: dict[str, Any] = {"misplaced": args.misplaced}
+    changed |= {} if args.pose_filter is None else {"pose_filter": args.pose_filter}
     task = make_task(args.env, BATCH, args.guidance, preset=args.preset, config=changed)
     task.anneal(error=error)
     success, raw, sizes = [], [], []
@@ -125,6 +131,7 @@ def main() -> None:
             shares = (share_text(float(x.float().mean()), len(x)) for x in (found.success, found.raw))
             rows.append((name, *shares, f"{found.action:.2f}"))
     about = "" if args.pose_filter is None else f", pose filter {args.pose_filter:g}"
+    about += ", objects misplaced" if args.misplaced == "object" else ""
     print(f"\n{args.env}, {args.preset}, guidance {args.guidance}{about}:")
     print(text_table(HEAD, rows))
 

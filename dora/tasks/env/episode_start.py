@@ -90,21 +90,24 @@ def begin_episodes(env: Any, rows: Int[Tensor, " b"]) -> None:
     for arm, e in zip(env.arms.values(), errors, strict=True):
         pose = env.objects[arm.spec.object].pose
         p, q = pose.p[rows], pose.q[rows]
+        e = env.perturbations.misplace(arm.name, rows, e, arm.guide.choice.error_scale)
         arm.choose(rows, p, q, env.task.reachable(arm, rows, p, q), e, randomisation, env.narrow.get(arm.name))
 
 
 def start_numbers(env: Any) -> dict[str, Float[Tensor, " n"]]:
     """How the running episodes began, as far as it was drawn at random: of each object `size` relative to the nominal
-    one, `mass` [kg] and `friction`; of each arm the distance of its first candidate from what the set holds, as
-    `candidate_error_mm` and `candidate_error_deg`. Names end in `_<object>` or `_<arm>` where there are several."""
+    one, `mass` [kg] and `friction`; of each arm the distance of its first candidate from what the set holds, or of a
+    misplaced object's measured pose from the true one, as `candidate_error_mm` and `candidate_error_deg`. Names end in
+    `_<object>` or `_<arm>` where there are several."""
     found: dict[str, Tensor] = {}
     for k, name in enumerate(env.objects):
         end, drawn = f"_{name}" if len(env.objects) > 1 else "", env.memory.objects[name]
         found |= {f"size{end}": env.scale[:, k], f"mass{end}": drawn.mass, f"friction{end}": drawn.friction}
     for name, choice in env.arms.choices.items():
         end, held, chosen = f"_{name}" if len(env.arms) > 1 else "", choice.candidates, choice.buffers.chosen.long()
-        away = (choice.buffers.position[:, 0] - held.position[chosen]).norm(dim=-1)
-        turn = rotation_angle(choice.buffers.quaternion[:, 0], held.quaternion[chosen])
+        shift, tilt = (part.norm(dim=-1) for part in env.perturbations.bias(name).split(3, -1))
+        away = (choice.buffers.position[:, 0] - held.position[chosen]).norm(dim=-1) + shift
+        turn = rotation_angle(choice.buffers.quaternion[:, 0], held.quaternion[chosen]) + tilt
         found |= {f"candidate_error_mm{end}": 1e3 * away, f"candidate_error_deg{end}": turn.rad2deg()}
     return found
 

@@ -61,6 +61,7 @@ class Perturbations:
         dt: duration of a control step [s].
         device: where the tensors are.
         pose_filter: share of the newest measurement in the estimate of an object's pose; 1 is no filter.
+        misplaced: whether measured poses are off by the error of candidates, which then have none of their own.
     """
 
     def __init__(
@@ -72,19 +73,52 @@ class Perturbations:
         dt: float,
         device: torch.device | str,
         pose_filter: float = 1.0,
+        misplaced: bool = False,
     ):
         self.randomisation, self._dt = randomisation, dt
         self._sensors = {arm: OBJECT_DRAWS + size for arm, size in hands.items()}
         self._filtered = tuple(hands) if pose_filter < 1 and randomisation.noisy else ()
         self._share = pose_filter
+        self._biased = tuple(hands) if misplaced else ()
+        biases = {f"{arm}_bias": (OBJECT_DRAWS,) for arm in self._biased}
         estimates = {f"{arm}_{name}": size for arm in self._filtered for name, size in ESTIMATE.items()}
         waiting = (max(randomisation.delay, 1), action_size)
-        self.buffers = Buffers(num_envs, device, key=(), waiting=waiting, **estimates)
+        self.buffers = Buffers(num_envs, device, key=(), waiting=waiting, **estimates, **biases)
 
     def begin(self, rows: Int[Tensor, " b"], share: Float[Tensor, " b"]) -> None:
         """Starts new episodes in the environments `rows`; `share` in [0, 1) chooses their keys."""
         counts = {f"{arm}_count": 0.0 for arm in self._filtered}
         self.buffers.write(rows, key=(share * KEYS).floor(), waiting=0.0, **counts)
+
+    def misplace(
+        self, arm: str, rows: Int[Tensor, " b"], error: Float[Tensor, "b e"], share: float = 1.0
+    ) -> Float[Tensor, "b e"]:
+        """Takes the error of an arm's candidates in new episodes as one of its object's measured pose, if objects are
+        misplaced; returns what is left for the candidates.
+
+        Args:
+            arm: its name.
+            rows: environments of the episodes.
+            error: numbers in [-1, 1]: 3 for position, 3 for rotation, then the fingers' joints.
+            share: of the randomisation's error in force.
+        """
+        if arm not in self._biased:
+            return error
+        r, pose = self.randomisation, error[:, :OBJECT_DRAWS]
+        widths = pose.new_tensor([r.candidate_position] * 3 + [r.candidate_rotation] * 3)
+        self.buffers.write(rows, **{f"{arm}_bias": share * widths * pose})
+        return torch.cat([torch.zeros_like(pose), error[:, OBJECT_DRAWS:]], -1)
+
+    def bias(self, arm: str) -> Float[Tensor, "n 6"]:
+        """Error of the measured poses of an arm's object that stays for the episode: shift in the world [m], and
+        rotation vector in the object's frame [rad]. Zero where candidates are misplaced instead."""
+        zero = torch.zeros(len(self.buffers.key), OBJECT_DRAWS, device=self.buffers.key.device)
+        return getattr(self.buffers, f"{arm}_bias") if arm in self._biased else zero
+
+    def biased(self, arm: str, pose: Pose) -> Pose:
+        """The pose of an arm's object with the error that stays."""
+        bias = self.bias(arm)
+        return pose[0] + bias[:, :3], quaternion_multiply(pose[1], quaternion_from_rotation_vector(bias[:, 3:]))
 
     def _draws(self, step: Tensor, start: int, size: int) -> Tensor:
         return uniform(self.buffers.key.long(), step.long(), start + size)[:, start:]
@@ -113,7 +147,8 @@ class Perturbations:
 
     def observed(self, s: S, choices: Mapping[str, CandidateChoice], step: Int[Tensor, " n"]) -> S:
         """The state as it is observed: poses of handled objects, all that follows from them, and hand joints are noisy.
-        The pose of a body that stands still has as large an error, which stays the same in the whole episode.
+        A misplaced object has its `bias` besides, also where it started. The pose of a body that stands still has as
+        large an error, which stays the same in the whole episode.
 
         Args:
             s: the true state.
@@ -121,15 +156,16 @@ class Perturbations:
             step: number of the control step in its episode.
         """
         r = self.randomisation
-        if not r.noisy:
+        if not (r.noisy or self._biased):
             return s
         errors = (2 * self._draws(step, 0, sum(self._sensors.values())) - 1).split(list(self._sensors.values()), -1)
         hands, objects, goals = dict(s.hands), dict(s.objects), dict(s.goals)
         for arm, error in zip(self._sensors, errors, strict=True):
             body, name = s.objects[s.handles[arm]], s.handles[arm]
-            position, quaternion = self._estimated(arm, self._displaced((body.p, body.q), error))
+            biased = self.biased(arm, (body.p, body.q))
+            position, quaternion = self._estimated(arm, self._displaced(biased, error))
             nearest_p, nearest_q, approach = choices[arm].goals(position, quaternion)
-            objects[name] = replace(body, p=position, q=quaternion)
+            objects[name] = replace(body, p=position, q=quaternion, start_p=body.start_p + biased[0] - body.p)
             hands[arm] = replace(s.hands[arm], q=s.hands[arm].q + r.observed_joint * error[:, OBJECT_DRAWS:])
             goals[arm] = replace(
                 s.goals[arm],

@@ -156,7 +156,9 @@ class TaskScene:
         """Noise, delay and pushes of the randomisation for these arms."""
         hands = {name: len(arm.agent.description.hand) for name, arm in self.arms.items()}
         c = self.config
-        return Perturbations(c.randomisation, self.num_envs, action_size, hands, c.dt, self.device, c.pose_filter)
+        misplaced = c.misplaced == "object"
+        numbers = (c.randomisation, self.num_envs, action_size, hands, c.dt, self.device, c.pose_filter, misplaced)
+        return Perturbations(*numbers)
 
     def snapshot(self, machine: Stages, memory: EpisodeMemory, time: Float[Tensor, " n"]) -> Snapshot:
         """The state now; arguments as of `StateReader.snapshot`."""

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dora.geometry.poses import Pose, compose
 from dora.geometry.rotations import (
     quaternion_apply,
     quaternion_inverse,
@@ -17,7 +18,11 @@ from dora.tasks.mdp.config import ResidualBounds
 
 
 def exact_correction(
-    choice: CandidateChoice, bounds: ResidualBounds, expand: Callable[[Tensor], Tensor], hand_size: int
+    choice: CandidateChoice,
+    bounds: ResidualBounds,
+    expand: Callable[[Tensor], Tensor],
+    hand_size: int,
+    frame: Pose | None = None,
 ) -> Float[Tensor, "n a"]:
     """The residual, in units of its bounds, with which the reference leads to the candidate as the set holds it.
 
@@ -29,12 +34,16 @@ def exact_correction(
         bounds: of the residual action.
         expand: maps the action's hand part to all hand joints.
         hand_size: components of that part.
+        frame: the object's true frame in the measured one, position (n, 3) [m] and wxyz, where a candidate is misplaced
+            with its object.
     """
     held, b = choice.candidates, choice.buffers
     chosen = b.chosen.long()
     wrong = quaternion_inverse(b.quaternion[:, 0])
-    shift = quaternion_apply(wrong, held.position[chosen] - b.position[:, 0]) / bounds.position
-    turn = rotation_vector_from_quaternion(quaternion_multiply(wrong, held.quaternion[chosen])) / bounds.rotation
+    right = held.position[chosen], held.quaternion[chosen]
+    right = right if frame is None else compose(frame, right)
+    shift = quaternion_apply(wrong, right[0] - b.position[:, 0]) / bounds.position
+    turn = rotation_vector_from_quaternion(quaternion_multiply(wrong, right[1])) / bounds.rotation
     bend = (held.grasp[chosen] - b.grasp) / bounds.joint
     unit = torch.eye(hand_size, device=bend.device)
     effect = expand(unit) - expand(torch.zeros_like(unit))  # (action's part, joints): how a component moves the joints

@@ -59,6 +59,9 @@ class TaskConfig:
     """Share of their velocity limits at which commands of finger joints move; control modes of joints ignore it [1]."""
     pose_filter: float = 1.0
     """Share of the newest measurement in the estimated pose of an object, for policy and reference; 1: no filter."""
+    misplaced: Literal["candidates", "object"] = "candidates"
+    """What is off by a candidate's error of position and orientation: the candidates, or the pose of their object as it
+    is measured, from which observation, candidates and reference follow. That error can only be felt."""
     hand_action: Literal["joints", "fingers"] = "joints"
     """What commands a hand: a number for each joint, or one for the bend of each finger and one for the thumb aside."""
     observe_candidate: bool = False
