@@ -183,7 +183,7 @@ TAKEN: list[dict[str, Any]] = [
     {"randomisation": {"size": 0.99}}, {"randomisation": {"friction": [0.0, 0.0]}}, {"randomisation": {"delay": 1000}},
     {"control_frequency": 1, "physics_frequency": 1}, {"arm_effort": 0.01}, {"pose_filter": 0.01},
     {"hand_speed": 0.01}, {"hand_speed": 1.0}, {"hand_effort": 0.01}, {"wrist_speed": 0.01}, {"overlap_grace": 0.0},
-    {"solver_iterations": 255}, {"control_frequency": 50},
+    {"solver_iterations": 255}, {"control_frequency": 50}, {"history": 100},
 ]  # fmt: skip
 REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"randomisation": {"size": 1.0}}, "size is 1.0; it is a share"),
@@ -196,7 +196,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"residual": {"position": -0.1}}, "residual"), ({"hold_time": -0.1}, "hold_time"),
     ({"hand_speed": 0.009}, "hand_speed"), ({"hand_speed": 1.01}, "hand_speed"),
     ({"hand_effort": 1.01}, "hand_effort"), ({"wrist_speed": 0.0}, "wrist_speed"),
-    ({"overlap_grace": -0.1}, "overlap_grace"),
+    ({"overlap_grace": -0.1}, "overlap_grace"), ({"history": -1}, "history"), ({"history": 101}, "history"),
 ]  # fmt: skip
 
 

@@ -136,7 +136,7 @@ NEUTRAL = {
     "definition": 1, "arm_effort": 1.0, "pose_filter": 1.0, "placed_after_overlap": 0.0, "reorient": "wrist",
     "observe_candidate": False, "hand_action": "joints", "overlap_range": 1.0,
     "hand_effort": 1.0, "wrist_speed": 1.0, "hand_speed": 1.0, "overlap_grace": 0.0,
-    "misplaced": "candidates",
+    "misplaced": "candidates", "history": 0,
 }  # fmt: skip
 """Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
 NOT_USUAL = {name: NEUTRAL[name] for name in ("pose_filter", "observe_candidate")}

@@ -10,7 +10,6 @@ from typing import Any, ClassVar, cast
 
 import gymnasium as gym
 import sapien
-import torch
 from jaxtyping import Bool, Float, Int
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
@@ -99,8 +98,8 @@ class DoraEnv(BaseEnv):
             guidance, guidance_parts, hand_joints, numbers, robot_uids, self.TASK.robots(), num_envs, control_mode,
             sim_backend, render_backend, render_mode, obs_mode,
         )  # fmt: skip
-        self.parts, self.config = options.parts, options.config
         self._grasps = check_grasps(grasps, tuple(self.TASK.ARMS))
+        self.parts, self.config = options.parts, options.config
         self.task, several = self.TASK(self.config), len(options.robots) > 1
         self._shares, self._tables = dict[str, float](), dict[str, ReachTable]()
         self._forced_scale: Tensor | None = None
@@ -122,8 +121,7 @@ class DoraEnv(BaseEnv):
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        wrists = {name: arm.agent.wrist for name, arm in self.arms.items()}
-        return camera_configs(self.task.CAMERAS, wrists, self.obs_mode_struct)
+        return camera_configs(self.task.CAMERAS, {a: x.agent.wrist for a, x in self.arms.items()}, self.obs_mode_struct)
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
@@ -154,6 +152,8 @@ class DoraEnv(BaseEnv):
         scene.make_reader(task)
         self.memory = scene.make_memory(self.action_size)
         self.perturbations = scene.make_perturbations(self.action_size)
+        self.history = scene.make_history(self.observation_entries, self.obs_mode_struct.use_state)
+        self.observation_entries |= self.history.entries
 
     def rebuild(self, scale: Float[Tensor, "n objects"]) -> None:
         """Builds the scene anew with objects of these relative sizes; begins new episodes."""
@@ -272,6 +272,7 @@ class DoraEnv(BaseEnv):
         step = self._elapsed_steps
         self.task.remember(self.snapshot)
         self.perturbations.remember(self.observed)
+        self.history.push(self.observed, action)
         command = None
         if action is not None:
             self.memory.record_action(action)
@@ -301,8 +302,7 @@ class DoraEnv(BaseEnv):
     def unreachable(self) -> Bool[Tensor, " n"]:
         """No candidate of some arm could be reached when the episode began. Such an episode fails at once and earns
         nothing (paper, Motion-Feasibility Filtering); never so without that part of guidance."""
-        none_left = self.arms.out_of_reach
-        return none_left if FILTER in self.parts else torch.zeros_like(none_left)
+        return self.arms.out_of_reach & (FILTER in self.parts)
 
     def evaluate(self) -> dict[str, Tensor]:
         """Success as the MDP says, failure, stages and overlap.

@@ -25,6 +25,7 @@ RATES = {
     "control_frequency": (1, 10_000), "physics_frequency": (1, 1_000_000), "solver_iterations": (1, 255),
     "arm_effort": (0.01, 1.0), "hand_effort": (0.01, 1.0), "wrist_speed": (0.01, 1.0), "hand_speed": (0.01, 1.0),
     "pose_filter": (0.01, 1.0), "overlap_range": (0.01, 1000.0), "overlap_grace": (0.0, 1000.0),
+    "history": (0, 100),
 }  # fmt: skip
 """Lowest and highest rates [Hz], position iterations, of which PhysX takes 255, and shares."""
 SHARES = ("size", "mass", "hinge")

@@ -34,7 +34,9 @@ from dora.tasks.guidance.guide import Guide
 from dora.tasks.guidance.residual_action import ResidualAction
 from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.guidance_parts import REGION
+from dora.tasks.mdp.history import History
 from dora.tasks.mdp.memory import EpisodeMemory, HandSizes
+from dora.tasks.mdp.observations import Entry
 from dora.tasks.mdp.snapshot import Snapshot
 from dora.tasks.mdp.stages import Stages
 
@@ -159,6 +161,11 @@ class TaskScene:
         misplaced = c.misplaced == "object"
         numbers = (c.randomisation, self.num_envs, action_size, hands, c.dt, self.device, c.pose_filter, misplaced)
         return Perturbations(*numbers)
+
+    def make_history(self, entries: Mapping[str, Entry], observed: bool) -> History:
+        """The history of these observations, of no step if the state is not `observed` at all."""
+        actions = {name: arm.action_size for name, arm in self.arms.items()}
+        return History(self.config.history if observed else 0, entries, actions, self.num_envs, self.device)
 
     def snapshot(self, machine: Stages, memory: EpisodeMemory, time: Float[Tensor, " n"]) -> Snapshot:
         """The state now; arguments as of `StateReader.snapshot`."""

@@ -24,7 +24,8 @@ def remembered(env: Any) -> dict[str, Any]:
     """What a task remembers of an episode, by name; each has get_state() and set_state(state, rows)."""
     guides = {f"guide.{name}": arm.guide for name, arm in env.arms.items()}
     own = {"memory": env.memory, "machine": env.machine, "perturbations": env.perturbations.buffers}
-    return own | guides | env.task.stateful()
+    history = {"history": env.history.buffers} if env.history.steps else {}
+    return own | guides | history | env.task.stateful()
 
 
 def saved_state(env: Any, simulator: dict[str, Any]) -> dict[str, Any]:

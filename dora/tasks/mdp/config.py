@@ -66,6 +66,8 @@ class TaskConfig:
     """What commands a hand: a number for each joint, or one for the bend of each finger and one for the thumb aside."""
     observe_candidate: bool = False
     """Whether the policy also observes where on the object the chosen candidate is; with guidance alone."""
+    history: int = 0
+    """Earlier control steps whose observations and actions the policy sees besides the present ones."""
     residual: ResidualBounds = field(default_factory=ResidualBounds)
     """Bounds of the residual action."""
     randomisation: Randomisation = field(default_factory=Randomisation)
