@@ -35,7 +35,7 @@ def environment() -> Any:
     env = SimpleNamespace(
         num_envs=2, device=CPU, arms={}, memory=memory(2, mass=torch.ones(2), friction=torch.ones(2)),
         machine=StageMachine(stages, 2, 0.05), task=SimpleNamespace(stateful=dict),
-        perturbations=SimpleNamespace(buffers=Buffers(2, CPU, key=(), waiting=(1, 3))),
+        perturbations=SimpleNamespace(buffers=Buffers(2, CPU, key=(), waiting=(1, 3))), history=SimpleNamespace(steps=0),
         _elapsed_steps=torch.zeros(2, dtype=torch.long), scale=torch.ones(2, 1),
     )  # fmt: skip
     pose = torch.zeros(2, 13)
