@@ -51,6 +51,18 @@ def test_a_misplaced_object_is_seen_where_the_error_of_its_candidates_puts_it():
     assert not plain.bias("arm").any()
 
 
+def test_what_is_not_misplaced_is_observed_as_before_to_the_last_bit():
+    """Stored runs are evaluated again bit for bit."""
+    p = torch.tensor([[0.1, 0.2, 0.3], [1.1, -2.7, 0.013]])
+    s = invented(2, object_p=p)
+    s = dataclasses.replace(s, objects={n: dataclasses.replace(o, start_p=p / 3) for n, o in s.objects.items()})
+    r, choice = Randomisation(observed_joint=0.1, candidate_position=0.1), CandidateChoice(along_x(0.1), 2, CPU)
+    seen = Perturbations(r, 2, 26, HANDS, 0.05, CPU).observed(s, {"arm": choice}, STEP)
+    assert torch.equal(seen.object.p, p)
+    assert torch.equal(seen.object.start_p, p / 3)
+    assert torch.equal(seen.object.q, s.object.q)
+
+
 @pytest.mark.parametrize("env_id", ["DoraJug-v1", "DoraHammer-v1", "DoraMicrowave-v1"])
 def test_nothing_but_the_measured_pose_of_a_misplaced_object_is_off(env_id: str):
     """From the same starts: the candidate's error becomes the pose's, and what is observed does not tell it."""

@@ -117,6 +117,8 @@ class Perturbations:
 
     def biased(self, arm: str, pose: Pose) -> Pose:
         """The pose of an arm's object with the error that stays."""
+        if arm not in self._biased:
+            return pose
         bias = self.bias(arm)
         return pose[0] + bias[:, :3], quaternion_multiply(pose[1], quaternion_from_rotation_vector(bias[:, 3:]))
 
@@ -162,10 +164,11 @@ class Perturbations:
         hands, objects, goals = dict(s.hands), dict(s.objects), dict(s.goals)
         for arm, error in zip(self._sensors, errors, strict=True):
             body, name = s.objects[s.handles[arm]], s.handles[arm]
-            biased = self.biased(arm, (body.p, body.q))
-            position, quaternion = self._estimated(arm, self._displaced(biased, error))
+            measured = self._displaced(self.biased(arm, (body.p, body.q)), error)
+            position, quaternion = self._estimated(arm, measured)
             nearest_p, nearest_q, approach = choices[arm].goals(position, quaternion)
-            objects[name] = replace(body, p=position, q=quaternion, start_p=body.start_p + biased[0] - body.p)
+            start_p = body.start_p + self.bias(arm)[:, :3]
+            objects[name] = replace(body, p=position, q=quaternion, start_p=start_p)
             hands[arm] = replace(s.hands[arm], q=s.hands[arm].q + r.observed_joint * error[:, OBJECT_DRAWS:])
             goals[arm] = replace(
                 s.goals[arm],
