@@ -118,6 +118,14 @@ def test_commands_move_no_faster_than_their_share_and_the_drives_push_no_more():
     task.close()
 
 
+def test_wrist_commands_are_rounded_as_in_stored_runs():
+    """Products of 32-bit numbers at full speed; the product of exact ones at a share of it. One bit changes contacts."""
+    for share, expected in ((1.0, torch.tensor([WRIST_SPEED, WRIST_SPIN]) * 0.05), (0.4, torch.tensor([0.012, 0.04]))):
+        task = tasks.make_task("DoraCube-v1", 1, "none", config={"wrist_speed": share})
+        assert torch.equal(task.agent.wrist_controller.wrist_scale[[0, 3]], expected)
+        task.close()
+
+
 def test_an_action_asks_for_the_joints_it_was_made_from(task: DoraEnv):
     controller = task.agent.wrist_controller
     joints = torch.rand(3, 20) * (controller.hand_upper - controller.hand_lower) + controller.hand_lower

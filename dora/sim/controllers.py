@@ -115,7 +115,9 @@ class WristHandController(BaseController):
         speed, spin = (self.wrist_speed * self.dt * full for full in self._motion)
         self.wrist_limits = (speed, spin)
         """Translation [m] and rotation [rad] of a full action in one control step."""
-        self.wrist_scale = torch.tensor([speed] * 3 + [spin] * 3, device=self.device)
+        scale = torch.tensor([speed] * 3 + [spin] * 3, device=self.device)
+        full = torch.tensor([self._motion[0]] * 3 + [self._motion[1]] * 3, device=self.device) * self.dt
+        self.wrist_scale = full if self.wrist_speed == 1 else scale  # as they are rounded in stored runs
 
     def limit(self, arm_effort: float, hand_effort: float, wrist_speed: float, hand_speed: float) -> None:
         """Makes arm and hand gentler where they meet something.
