@@ -119,7 +119,7 @@ def test_commands_move_no_faster_than_their_share_and_the_drives_push_no_more():
 
 
 def test_wrist_commands_are_rounded_as_in_stored_runs():
-    """Products of 32-bit numbers at full speed; the product of exact ones at a share of it. One bit changes contacts."""
+    """Products of 32-bit numbers at full speed, of exact ones at a share of it: one bit changes contacts."""
     for share, expected in ((1.0, torch.tensor([WRIST_SPEED, WRIST_SPIN]) * 0.05), (0.4, torch.tensor([0.012, 0.04]))):
         task = tasks.make_task("DoraCube-v1", 1, "none", config={"wrist_speed": share})
         assert torch.equal(task.agent.wrist_controller.wrist_scale[[0, 3]], expected)
