@@ -28,6 +28,7 @@ import tyro
 
 from dora.agents.checkpoint import read_checkpoint
 from dora.agents.config import LEARNER_CONFIGS, Agent, Numbers, RunConfig, Settings
+from dora.agents.evaluation.agreement import agreement
 from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed, outcome
 from dora.agents.evaluation.play import checkpoint_path, evaluate_checkpoint, evaluate_zero, load_policy, record
 from dora.agents.limits import check, check_episodes
@@ -344,6 +345,8 @@ def evaluate_only(args: Args) -> Path:
         progress = {name: checkpoint.progress.get(name, value) for name, value in progress.items()}
         print(outcome(evaluation, zero), file=sys.stderr)
     folder.write_evaluation(evaluation, zero if path else None)
+    if path is not None and (said := agreement(path, folder.path / "eval.csv", config, args.first_seed)):
+        print(said, file=sys.stderr)
     result = make_result(config, evaluation=evaluation, zero=zero, finished=True, **progress)
     folder.write_result(result | {"agent": agent, "checkpoint": None if path is None else str(path)})
     return folder.path
