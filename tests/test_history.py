@@ -77,17 +77,19 @@ def test_an_arm_remembers_what_it_saw_and_did_itself():
     short.close()
 
 
-def test_a_restored_episode_goes_on_with_its_history():
-    task = tasks.make_task("DoraJug-v1", 3, config={"history": STEPS})
+@pytest.mark.parametrize("env_id", ["DoraJug-v1", "DoraHammer-v1"])
+def test_a_restored_episode_goes_on_with_its_history(env_id: str):
+    """The hammer's task has a memory of its own, which is called history, too."""
+    task = tasks.make_task(env_id, 3, config={"history": STEPS})
     task.reset(seed=SEEDS)
     for k in range(3):
         task.step(torch.full((3, task.action_size), 0.1 * k))
     entry = task.observation_entries["history"]
     state, history = task.get_state_dict(), entry.value(task.observed).clone()
-    assert state["history"]["frames"].shape == (3, history.shape[1])
+    assert state["past"]["frames"].shape == (3, history.shape[1])
     task.step(torch.ones(3, task.action_size))
     assert not torch.equal(entry.value(task.observed), history)
-    other = tasks.make_task("DoraJug-v1", 3, config={"history": STEPS})
+    other = tasks.make_task(env_id, 3, config={"history": STEPS})
     other.reset(seed=1)
     for made in (task, other):
         made.set_state_dict(state)
@@ -99,7 +101,7 @@ def test_without_history_nothing_is_kept():
     task = tasks.make_task("DoraJug-v1", 2)
     task.reset(seed=0)
     assert "history" not in task.observation_entries
-    assert "history" not in task.get_state_dict()
+    assert "past" not in task.get_state_dict()
     task.close()
     none = History(0, {"x": Entry(lambda s: s.time[:, None], "1", "time")}, {"arm": 2}, 1, "cpu")
     none.push(invented(1), torch.zeros(1, 2))

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dora.agents.config import RunConfig
-from dora.agents.evaluation.agreement import agreement
+from dora.agents.runs.agreement import agreement
 from dora.commands import run
 
 RESULTS = Path(__file__).parents[1] / "results"

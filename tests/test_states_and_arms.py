@@ -34,7 +34,7 @@ def environment() -> Any:
     stages = [Stage[Any]("one", lambda s: s > 0), Stage[Any]("two", lambda s: s > 0)]
     env = SimpleNamespace(
         num_envs=2, device=CPU, arms={}, memory=memory(2, mass=torch.ones(2), friction=torch.ones(2)),
-        machine=StageMachine(stages, 2, 0.05), task=SimpleNamespace(stateful=dict), history=SimpleNamespace(steps=0),
+        machine=StageMachine(stages, 2, 0.05), task=SimpleNamespace(stateful=dict), past=SimpleNamespace(steps=0),
         perturbations=SimpleNamespace(buffers=Buffers(2, CPU, key=(), waiting=(1, 3))),
         _elapsed_steps=torch.zeros(2, dtype=torch.long), scale=torch.ones(2, 1),
     )  # fmt: skip

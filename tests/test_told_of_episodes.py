@@ -148,7 +148,9 @@ def begun(objects: tuple[str, ...], choices: dict[str, Any]) -> dict[str, Tensor
     arms = type("Arms", (dict,), {"choices": choices})(dict.fromkeys(choices))
     scale = torch.tensor([[0.9, 1.1], [0.8, 1.2]])[:, : len(objects)]
     memory = SimpleNamespace(objects=drawn)
-    return start_numbers(SimpleNamespace(objects=dict.fromkeys(objects), memory=memory, arms=arms, scale=scale))
+    off = SimpleNamespace(bias=lambda name: torch.zeros(2, 6))
+    known = SimpleNamespace(objects=dict.fromkeys(objects), memory=memory, arms=arms, scale=scale, perturbations=off)
+    return start_numbers(known)
 
 
 def test_one_object_and_one_arm_have_no_names():

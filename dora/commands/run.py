@@ -28,10 +28,10 @@ import tyro
 
 from dora.agents.checkpoint import read_checkpoint
 from dora.agents.config import LEARNER_CONFIGS, Agent, Numbers, RunConfig, Settings
-from dora.agents.evaluation.agreement import agreement
 from dora.agents.evaluation.evaluate import FINAL_SEED, first_seed, outcome
 from dora.agents.evaluation.play import checkpoint_path, evaluate_checkpoint, evaluate_zero, load_policy, record
 from dora.agents.limits import check, check_episodes
+from dora.agents.runs.agreement import agreement
 from dora.agents.runs.interrupt import STATUS, ending_at_once
 from dora.agents.runs.logging import add_film
 from dora.agents.runs.recommended import learners_of, recommended

@@ -152,8 +152,8 @@ class DoraEnv(BaseEnv):
         scene.make_reader(task)
         self.memory = scene.make_memory(self.action_size)
         self.perturbations = scene.make_perturbations(self.action_size)
-        self.history = scene.make_history(self.observation_entries, self.obs_mode_struct.use_state)
-        self.observation_entries |= self.history.entries
+        self.past = scene.make_history(self.observation_entries, self.obs_mode_struct.use_state)
+        self.observation_entries |= self.past.entries
 
     def rebuild(self, scale: Float[Tensor, "n objects"]) -> None:
         """Builds the scene anew with objects of these relative sizes; begins new episodes."""
@@ -272,7 +272,7 @@ class DoraEnv(BaseEnv):
         step = self._elapsed_steps
         self.task.remember(self.snapshot)
         self.perturbations.remember(self.observed)
-        self.history.push(self.observed, action)
+        self.past.push(self.observed, action)
         command = None
         if action is not None:
             self.memory.record_action(action)

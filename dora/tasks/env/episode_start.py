@@ -86,7 +86,7 @@ def begin_episodes(env: Any, rows: Int[Tensor, " b"]) -> None:
     env.task_scene.apply_properties(env.memory, rows)
     env.machine.reset(rows)
     env.perturbations.begin(rows, key[:, 0])
-    env.history.begin(rows)
+    env.past.begin(rows)
     errors = (2 * error - 1).split([choice.error_draws for choice in env.arms.choices.values()], -1)
     for arm, e in zip(env.arms.values(), errors, strict=True):
         pose = env.objects[arm.spec.object].pose

@@ -24,8 +24,8 @@ def remembered(env: Any) -> dict[str, Any]:
     """What a task remembers of an episode, by name; each has get_state() and set_state(state, rows)."""
     guides = {f"guide.{name}": arm.guide for name, arm in env.arms.items()}
     own = {"memory": env.memory, "machine": env.machine, "perturbations": env.perturbations.buffers}
-    history = {"history": env.history.buffers} if env.history.steps else {}
-    return own | guides | history | env.task.stateful()
+    past = {"past": env.past.buffers} if env.past.steps else {}
+    return own | guides | past | env.task.stateful()
 
 
 def saved_state(env: Any, simulator: dict[str, Any]) -> dict[str, Any]:
