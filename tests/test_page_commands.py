@@ -8,6 +8,7 @@ import pytest
 
 from dora.commands import run
 from dora.errors import InputError
+from dora.tasks import task_ids
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -32,8 +33,14 @@ SHOWN = [(page, words) for page in PAGES for words in dict.fromkeys(commands(pag
 
 @pytest.mark.parametrize(("page", "words"), SHOWN, ids=[f"{page.name}: {words}" for page, words in SHOWN])
 def test_a_command_of_a_page_is_understood(page: Path, words: str, monkeypatch: pytest.MonkeyPatch):
+    """Its options arrive: task, learner and seed are those that it names."""
     monkeypatch.chdir(ROOT)
-    run.parse(shlex.split(words))
+    given = shlex.split(words)
+    args = run.parse(given)
+    named = {name: given[given.index(f"--{name}") + 1] for name in ("env", "agent", "seed") if f"--{name}" in given}
+    assert {name: str(getattr(args.run, name)) for name in named} == named
+    assert args.eval_only == ("--eval-only" in given)
+    assert args.run.env in task_ids()
 
 
 def test_most_commands_are_looked_at():

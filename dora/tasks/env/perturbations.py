@@ -167,7 +167,7 @@ class Perturbations:
             measured = self._displaced(self.biased(arm, (body.p, body.q)), error)
             position, quaternion = self._estimated(arm, measured)
             nearest_p, nearest_q, approach = choices[arm].goals(position, quaternion)
-            start_p = body.start_p + self.bias(arm)[:, :3]
+            start_p = body.start_p + self.bias(arm)[:, :3] if arm in self._biased else body.start_p
             objects[name] = replace(body, p=position, q=quaternion, start_p=start_p)
             hands[arm] = replace(s.hands[arm], q=s.hands[arm].q + r.observed_joint * error[:, OBJECT_DRAWS:])
             goals[arm] = replace(
