@@ -42,8 +42,13 @@ def bench() -> Iterator[tasks.DoraEnv]:
 
 
 def over_nail(task: tasks.DoraEnv, gap: float, speed: float) -> sapien.physx.PhysxRigidDynamicComponent:
-    """Puts the hammer face down over the nail, `gap` [m] above it and moving down."""
+    """Puts the hammer face down over the nail, `gap` [m] above it and moving down, in a new episode."""
     task.reset(seed=0)
+    return again_over_nail(task, gap, speed)
+
+
+def again_over_nail(task: tasks.DoraEnv, gap: float, speed: float) -> sapien.physx.PhysxRigidDynamicComponent:
+    """The same in the same episode: `gap` above where the nail's head was at its beginning."""
     strike = Strike(torch.tensor(CONFIG.nail.top), task.task.points["face"], CONFIG.swing_radius)
     task.target_object.set_pose(Pose.create_from_pq(*strike.hammer(torch.zeros(1), torch.zeros(1), gap)))
     task.target_object.set_linear_velocity(torch.tensor([[0.0, 0.0, -speed]]))
@@ -109,6 +114,42 @@ def test_pushing_on_after_a_touch_ends_the_blow(bench: tasks.DoraEnv, push: floa
     print(f"{push:g} N: {depth:.1f} mm, driven {driven:.1f} mm")
     assert depth > least
     assert 0.3 < driven < 6  # of the 10 mm that it takes
+
+
+def test_what_a_blow_left_over_is_not_there_for_a_push_after_the_next_one(bench: tasks.DoraEnv):
+    """A free hammer sinks the nail less far than one in a hand would: the rest must not count half a second later."""
+    over_nail(bench, 0.01, 1.6)
+    depth, first = run(bench, 4)
+    assert first == pytest.approx(depth, abs=0.05)
+    assert bench.task.nail._left.item() > 0.005
+    again_over_nail(bench, 0.10, 0.0)
+    bench.target_object._bodies[0].disable_gravity = True
+    run(bench, 20)
+    bench.target_object._bodies[0].disable_gravity = False
+    body, before = again_over_nail(bench, 0.006 - depth / 1000, 0.55), depth
+
+    def push(_: int) -> None:
+        if 1000 * bench.task.nail.depth.item() > before + 1e-3:
+            body.add_force_at_point([0.0, 0.0, -60.0], body.entity_pose.p)
+
+    watch_physics(bench.scene, push)
+    depth, driven = run(bench, 8)
+    bench.reset(seed=0)
+    print(f"first blow {first:.1f} mm; a touch and a push {depth - before:.1f} mm, counted {driven - first:.1f} mm")
+    assert depth - before > 20
+    assert 0.3 < driven - first < 6
+
+
+def test_a_second_blow_counts_as_far_as_its_own_momentum():
+    """Whatever the first has left, in the time of a blow or after it."""
+    nail: Any = Nail.__new__(Nail)
+    nail.settings, nail._hammers = CONFIG.nail, [SimpleNamespace(mass=0.5)]
+    nail._left, nail._reach, nail._since = (np.zeros(1) for _ in range(3))
+    nail._strike(0, 1.5, 0.0)
+    reach, nail._left[0] = nail._left[0], 0.001
+    nail._since[0] = CONFIG.nail.blow_window
+    nail._strike(0, 1.5, 0.0)
+    assert nail._left[0] == reach
 
 
 def test_blows_of_a_free_hammer_count_whole(bench: tasks.DoraEnv):

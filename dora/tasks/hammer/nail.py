@@ -10,7 +10,8 @@ The hammer's blow starts the nail at nearly the hammer's speed and is then spent
 moves it too, and a nail pushed in has not been hammered: a blow is an impact above `blow_speed` of the striking face on
 the nail's head. What the nail sinks within `blow_window` after one counts as driven while nothing but that face presses
 on the nail, and at most as far as the momentum of hammer and hand by itself would drive it (`driven_by_momentum`): more
-cannot be had by pushing on. A hammer that no hand holds strikes no blow.
+cannot be had by pushing on, and what a blow has left over is not there for the next one. A hammer that no hand holds
+strikes no blow.
 """
 
 from dataclasses import dataclass
@@ -215,7 +216,7 @@ class Nail:
         already [m/s]."""
         mass = self._mass(i)
         reach = driven_by_momentum(self.settings, struck(self.settings, speed, sinking, mass), mass)
-        if self._left[i] > 0:  # the same blow
+        if self._left[i] > 0 and self._since[i] < self.settings.blow_window:  # the same blow
             reach = max(reach, self._reach[i])
             self._left[i] += reach - self._reach[i]
         else:

@@ -166,8 +166,9 @@ class HammerTask(Task):
     **Stages:** catch (the handle is in the hand, touched by two fingers, slower than 0.5 m/s in it, for 0.075 s),
     stabilise (moves less than 8 mm and 0.15 rad in the hand within 0.25 s), orient (striking axis within 15 degrees
     of the nail axis, face within 15 mm of that axis and 5 mm below to 15 cm above the head, for 0.25 s), strike
-    (blows drive the nail 10 mm; its motion within 50 ms after an impact of the striking face on its head above 0.5
-    m/s counts).
+    (blows drive the nail 10 mm: its motion within 50 ms after an impact of the striking face on its head above 0.5
+    m/s counts, as far as the momentum of hammer and hand would drive it, while nothing else touches the nail and two
+    fingers hold the hammer).
 
     With `reorient="in_hand"` the hammer arrives turned about its handle by 45 to 90 degrees, and a stage turn comes
     before orient: the fingers have turned it by 40 degrees in the hand, towards the blow.
