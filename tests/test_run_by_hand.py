@@ -49,7 +49,8 @@ def result_of(**changes: Any) -> dict[str, Any]:
     given: dict[str, Any] = {
         "env_steps": 12_345, "wall_seconds": 100.00049, "episodes": 11,
         "evaluation": evaluation_of([1.0, 0.0, 1.0, 0.0]),
-        "zero": evaluation_of([1.0, 0.0, 0.0, 0.0]), "finished": True, "nonfinite": 4, "other_seconds": 25.0,
+        "zero": evaluation_of([1.0, 0.0, 0.0, 0.0]), "finished": True, "nonfinite": 4,
+        "other_seconds": 25.0, "commit": "abc",
         "curve": [[100, 1.0, 0.5], [200, 2.0, 0.79], [300, 3.0, 0.8], [400, 4.0, 1.0]],
     }  # fmt: skip
     return make_result(CONFIG, **given | changes)
@@ -64,7 +65,7 @@ def test_a_result_says_what_was_evaluated_and_how_fast_it_was():
         "guidance_parts": ["prior"], "raw_success_rate": 1.0, "success_at_end_rate": 0.5, "nonfinite_episodes": 7,
         "ranking_steps": 9, "steps_to_50": 100, "steps_to_80": 300, "first_seed": 70, "finished": True, "seed": 7,
         "num_envs": 5, "workers": 3, "reward": "dense", "other_load": pytest.approx(0.25, rel=1e-4),
-        "config_digest": CONFIG.digest(),
+        "config_digest": CONFIG.digest(), "commit": "abc",
     }  # fmt: skip
     assert {name: found[name] for name in wanted} == wanted
     assert found["success_interval"] == pytest.approx([0.1500, 0.8500], abs=1e-4)

@@ -45,6 +45,7 @@ from dora.tasks.env.options import numbers_under_preset, task_config
 from dora.tasks.mdp.guidance_parts import guidance_in_force
 from dora.tasks.mdp.randomisation import find_preset
 from dora.tools.command_line import HELP, read_some
+from dora.version import source_commit
 
 VIDEO_EPISODES = 3
 """Episodes of a film [1]."""
@@ -293,12 +294,14 @@ def train(args: Args) -> tuple[Path, int]:
         folder.write_config(config)  # a larger budget, once it is known that the run can go on
         go_on = "To go on: " + shlex.join([*started_as(sys.orig_argv, sys.argv), "--resume", str(folder.path)])
         try:
-            trainer.run()
+            finished = trainer.run()["finished"]
         except RunFailure as error:
             print(f"{error} {go_on}", file=sys.stderr)
             return folder.path, FAILED
         if trainer.interrupted is not None:
-            print(f"Interrupted and saved. {go_on}", file=sys.stderr)
+            if not finished:
+                done = "and saved" if trainer.saved else "since the last checkpoint nothing is saved"
+                print(f"Interrupted, {done}. {go_on}", file=sys.stderr)
             return folder.path, STATUS + trainer.interrupted
     if args.video and film(folder.best, config, folder.video / "best.mp4"):
         add_film(folder.path, folder.video / "best.mp4", trainer.counters.env_steps)
@@ -320,7 +323,7 @@ def started_as(original: Sequence[str], own: Sequence[str]) -> list[str]:
 
 def evaluate_only(args: Args) -> Path:
     """Film, if asked for, and evaluate a checkpoint or zero correction into a new run folder, which is returned."""
-    config = args.run
+    config, commit = args.run, source_commit()
     path = None if args.checkpoint is None else checkpoint_path(args.checkpoint)
     agent = ZERO if path is None else config.agent
     folder = RunFolder(args.out or default_folder(config, agent, "-eval"))
@@ -347,7 +350,7 @@ def evaluate_only(args: Args) -> Path:
     folder.write_evaluation(evaluation, zero if path else None)
     if path is not None and (said := agreement(path, folder.path / "eval.csv", config, args.first_seed)):
         print(said, file=sys.stderr)
-    result = make_result(config, evaluation=evaluation, zero=zero, finished=True, **progress)
+    result = make_result(config, evaluation=evaluation, zero=zero, finished=True, commit=commit, **progress)
     folder.write_result(result | {"agent": agent, "checkpoint": None if path is None else str(path)})
     return folder.path
 

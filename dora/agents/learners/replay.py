@@ -8,26 +8,34 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 
 from dora.errors import InputError
-from dora.files import read_safetensors, write_safetensors
+from dora.files import MOST_BYTES, read_safetensors, write_safetensors
 
 FORMAT = "dora-replay 1"
 """Format and version of a file of transitions."""
 SHARD = 16_384
 """Largest number of transitions per file."""
+FULL = MOST_BYTES // 2
+"""Size of a file that is not exceeded, if transitions are so large that fewer fit [bytes]."""
 
 
 class Replay:
     """TorchRL's uniform replay buffer of the newest `capacity` transitions, stored in immutable files.
 
-    Transition k (counted from the start of the run) is in slot k mod capacity and in shard k // SHARD. A file
+    Transition k (counted from the start of the run) is in slot k mod capacity and in shard k // shard. A file
     holds those transitions of one shard that the buffer has, is named after the first and the end, and never
     changes; a checkpoint keeps the total, from which the files follow, so only the oldest and the newest
     shard are written anew. Files of older checkpoints are removed only after the newer checkpoint is in
     place, so that every checkpoint on disk is complete.
+
+    Args:
+        capacity: transitions.
+        batch: transitions of a sample.
+        size: of a transition [bytes], at most; files of large ones hold fewer.
     """
 
-    def __init__(self, capacity: int, batch: int):
+    def __init__(self, capacity: int, batch: int, size: int = 1):
         self.capacity, self.added = capacity, 0
+        self.shard = min(SHARD, max(FULL // size, 1))
         self.buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(capacity), sampler=RandomSampler(), batch_size=batch
         )
@@ -96,7 +104,7 @@ class Replay:
         shards = []
         first = self.added - len(self)
         while first < self.added:
-            end = min((first // SHARD + 1) * SHARD, self.added)
+            end = min((first // self.shard + 1) * self.shard, self.added)
             shards.append((f"{first:010d}-{end:010d}.safetensors", first, end))
             first = end
         return shards

@@ -19,6 +19,8 @@ from dora.agents.learners.stopping import Stop, never
 
 ACTOR_PERIOD = 2
 """Gradient steps of the critics per gradient step of actor and temperature."""
+FLOAT, OTHERS = 4, 64
+"""Size of a number of a transition, and of what it holds besides observations and action, at most [bytes]."""
 
 
 class SAC:
@@ -59,7 +61,7 @@ class SAC:
             "critic_adam": torch.optim.Adam(self.critic_parameters, lr=config.learning_rate, fused=True),
             "alpha_adam": torch.optim.Adam([log_alpha], lr=config.learning_rate_alpha, fused=True),
         }
-        self.replay = Replay(config.capacity, config.batch)
+        self.replay = Replay(config.capacity, config.batch, FLOAT * (2 * observation + action) + OTHERS)
         self._latest = LatestOutput()
         self.actor.register_forward_hook(self._latest)
         self.updates, self.due = 0, 0.0

@@ -102,7 +102,8 @@ class RunLog:
 
     Args:
         folder: of the run.
-        first_step: with which it goes on; at 0 the table of tags, the layout and the settings are written.
+        first_step: after which it goes on; later events of earlier calls are hidden. At 0 the table of tags, the
+            layout and the settings are written.
         config: settings of the run, for the page of hyperparameters.
     """
 
@@ -111,7 +112,7 @@ class RunLog:
         self._writer: SummaryWriter | None = None
         self._settings = {} if config is None else flat_settings(config)
         with self._writing():
-            self._writer = SummaryWriter(str(folder), purge_step=first_step or None)
+            self._writer = SummaryWriter(str(folder), purge_step=first_step + 1 if first_step else 0)
             if first_step == 0:
                 self._writer.add_text("tags", tags_table())
                 self._writer.add_custom_scalars(LAYOUT)

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from torch import Tensor
 
+from dora.agents.collecting.task_env import EpisodeColumns
 from dora.agents.runs.stored_results import LARGEST, MOST_COLUMNS, MOST_ROWS, MOST_TABLE
 from dora.errors import InputError
 from dora.files import write_bytes
@@ -15,10 +17,29 @@ from dora.reading import read_bytes
 
 COLUMNS = ("env_steps", "seconds", "episodes", "success_rate", "raw_success_rate", "return_mean", "penetration_mm")
 """First columns; those of the stages follow. Rates and means are over the episodes that ended in the iteration."""
+RENAMED = {
+    "success": "success_rate",
+    "raw_success": "raw_success_rate",
+    "success_at_end": "success_at_end_rate",
+    "return": "return_mean",
+    "length": "length_mean",
+}
+"""Names of the means of the columns of episodes."""
 MOST_RESUMED = 2**28
 """Size of a table above which its run is not gone on with [bytes]."""
 STAGE = "stage/"
 """Beginning of the name of a stage's column."""
+
+
+def means_of(ended: Float[Tensor, "e k"], columns: EpisodeColumns) -> dict[str, float]:
+    """Means over the episodes that ended, by the names that they have in the table and the logs; none of none.
+
+    Args:
+        ended: a row for each episode.
+        columns: of these rows.
+    """
+    names = [name for name in columns.names if name != "whole"] if len(ended) else []
+    return {RENAMED.get(name, name): float(columns.column(ended, name).mean()) for name in names}
 
 
 def read_progress(path: Path) -> dict[str, Float[np.ndarray, " rows"]]:

@@ -10,7 +10,9 @@ from dora.configs import overridden
 from dora.errors import InputError
 from dora.parallel import available_cores
 
-WITHOUT_PRIOR: dict[str, dict[str, Any]] = {name: {"prior": 0.0} for name in LEARNER_CONFIGS}
+WITHOUT_PRIOR: dict[str, dict[str, Any]] = {
+    name: {"prior": 0.0} for name, settings in LEARNER_CONFIGS.items() if hasattr(settings, "prior")
+}
 """Settings of each learner where actions are no residuals and zero action is no prior to be pulled to."""
 ALL: Mapping[str, Mapping[str, Any]] = {name: {} for name in LEARNER_CONFIGS}
 """The learners of a task that recommends nothing."""

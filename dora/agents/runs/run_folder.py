@@ -259,10 +259,12 @@ def make_result(
     zero: Evaluation | None,
     curve: list[list[Any]],
     finished: bool,
+    commit: str | None,
     nonfinite: int = 0,
     other_seconds: float | None = None,
 ) -> dict[str, Any]:
     """Content of `result.json`; rates are null where nothing was evaluated. `curve` has the rows of `curve.csv`,
+    `commit` is that of the sources when the program was started (None: not known),
     `nonfinite` is the number of training episodes whose simulation was not finite, `other_seconds` the processor time
     that other programs took meanwhile [s], None where it is not known."""
     rate = env_steps / wall_seconds if wall_seconds > 0 else 0.0
@@ -273,7 +275,7 @@ def make_result(
         "guidance": config.guidance,
         "preset": config.preset,
         "seed": config.seed,
-        "commit": source_commit(),
+        "commit": commit,
         "task_config": config.task,
         "env_steps": env_steps,
         "wall_seconds": round(wall_seconds, 3),

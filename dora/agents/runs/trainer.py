@@ -1,6 +1,7 @@
 """The training loop that all learners share."""
 
 import functools
+import math
 import os
 import signal
 import sys
@@ -45,27 +46,26 @@ from dora.agents.limits import check_checkpoint
 from dora.agents.runs.interrupt import Interrupt
 from dora.agents.runs.logging import RunLog
 from dora.agents.runs.machine import OtherLoad
-from dora.agents.runs.progress_table import ProgressTable
+from dora.agents.runs.progress_table import ProgressTable, means_of
 from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.agents.seeds import seeds_for
 from dora.errors import RECORDS, InputError, WorkerFailure
 from dora.parallel import name_leftovers
 from dora.progress import ProgressDisplay
+from dora.version import source_commit
 
-RENAMED = {
-    "success": "success_rate",
-    "raw_success": "raw_success_rate",
-    "success_at_end": "success_at_end_rate",
-    "return": "return_mean",
-    "length": "length_mean",
-}
-"""Names of the means of the columns of episodes."""
+ENOUGH = 2
+"""Evaluations in a row that have to reach `stop_success`."""
 RECENT = 200
 """Number of latest training episodes over which the displayed success rate is taken."""
 
 
 class Trainer:
     """One run: trains, evaluates, logs and saves in a run folder.
+
+    Attributes:
+        interrupted: the signal that asked the run to end, None if there was none.
+        saved: whether all that was trained until then is in the latest checkpoint.
 
     Args:
         config: settings.
@@ -91,10 +91,12 @@ class Trainer:
     ):
         name_leftovers()  # a replay buffer has semaphores
         self._others, self._looked = OtherLoad(), time.perf_counter()
+        self._commit = source_commit()  # of the code that runs: the checkout may change meanwhile
         self.config, self.make_task, self.folder, self._zero, self._cluster = config, make_task, folder, zero, cluster
         torch.set_num_threads(config.learner_threads)
         os.environ[RECORDS] = str(folder.nonfinite.absolute())  # processes that are started later see it, too
         self.interrupted: int | None = None
+        self.saved = False
         self.counters = Counters(next_evaluation=config.eval_every)
         self._evaluators = Evaluators(make_task, config)
         self.columns: EpisodeColumns = self._evaluators.env.columns
@@ -114,7 +116,8 @@ class Trainer:
     def run(self) -> dict[str, Any]:
         """Train until the budget is spent or `stop_success` is reached; returns what `result.json` got.
 
-        After Ctrl-C or SIGTERM the state is saved, the result has `finished` false, and `interrupted` is the signal.
+        After Ctrl-C or SIGTERM the state is saved, the result has `finished` false, and `interrupted` is the signal; a
+        signal while the result of a finished run is written changes nothing of it.
 
         Raises:
             RunFailure: if training diverged, in which case the last checkpoint stays, or a worker failed, in which
@@ -138,6 +141,8 @@ class Trainer:
                 if finished:
                     log.add_final(result, self.counters.env_steps)
                 log.close()
+        if finished:
+            self.interrupted = interrupt.number
         return result
 
     def _train_and_evaluate(self, log: RunLog, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
@@ -150,10 +155,12 @@ class Trainer:
             except (KeyboardInterrupt, WorkerFailure) as error:
                 if not interrupt.at_once:  # else perhaps in the middle of learning
                     self.save()
+                    self.saved = True
                 if interrupt.requested and isinstance(error, WorkerFailure):
                     raise KeyboardInterrupt from None  # the same signal ended the worker
                 raise
         self.save()
+        self.saved = True
         progress.say(f"last evaluation of the best policy, on {self.config.final_episodes} episodes ...")
         evaluation, zero = self._final_evaluation(interrupt)
         progress.say(outcome(evaluation, zero))
@@ -171,6 +178,7 @@ class Trainer:
             zero=zero,
             curve=counters.curve,
             finished=finished,
+            commit=self._commit,
             nonfinite=counters.nonfinite,
             other_seconds=counters.other_seconds,
         )
@@ -204,7 +212,9 @@ class Trainer:
     def _train(self, rollouts: Rollouts, log: RunLog, progress: ProgressDisplay, interrupt: Interrupt) -> None:
         counters, config = self.counters, self.config
         show, saved = progress.bar("training"), time.monotonic()
-        while counters.env_steps < config.total_steps:
+        if self._evaluation_is_due():  # that which was interrupted, and perhaps the last one
+            self._evaluate(log, progress, interrupt)
+        while counters.env_steps < config.total_steps and counters.reached < ENOUGH:
             interrupt.check()
             start = time.perf_counter()
             batch = rollouts.collect(interrupt.check)
@@ -219,11 +229,10 @@ class Trainer:
             counters.seconds["collect"] += collected - start
             counters.seconds["learn"] += learned - collected
             self._take_time()
-            rate = batch.numel() / (learned - start)
-            self._log_iteration(log, values, ended, rate)
+            self._log_iteration(log, values, ended, batch.numel() / (learned - start))
             interrupt.check()
-            if self._evaluation_is_due() and self._evaluate(log, progress, interrupt):
-                break
+            if self._evaluation_is_due():
+                self._evaluate(log, progress, interrupt)
             if time.monotonic() - saved > config.checkpoint_seconds:
                 self.save()
                 saved = time.monotonic()
@@ -267,16 +276,15 @@ class Trainer:
         shares = {f"{k}_share": v / counters.wall_seconds for k, v in counters.seconds.items()}
         log.add("speed", {"steps_per_second": rate, **shares}, step)
         self._recent = torch.cat([self._recent, ended])[-RECENT:]
-        names = [name for name in self.columns.names if name != "whole"] if len(ended) else []
-        means = {RENAMED.get(name, name): float(self.columns.column(ended, name).mean()) for name in names}
+        means = means_of(ended, self.columns)
         log.add("training", means, step)
         self._table.add({"env_steps": step, "seconds": counters.wall_seconds, "episodes": len(ended)} | means)
 
     def _evaluation_is_due(self) -> bool:
         return self.counters.env_steps >= self.counters.next_evaluation
 
-    def _evaluate(self, log: RunLog, progress: ProgressDisplay, interrupt: Interrupt) -> bool:
-        """Evaluate and keep the policy if it is the best so far; returns whether the run may end."""
+    def _evaluate(self, log: RunLog, progress: ProgressDisplay, interrupt: Interrupt) -> None:
+        """Evaluate, and keep the policy if it is the best so far."""
         counters, config = self.counters, self.config
         if not self.folder.latest.exists():  # where a policy has been evaluated, there is a checkpoint to go on from
             self.save()
@@ -294,7 +302,7 @@ class Trainer:
         if depth is not None:
             log.add("evaluation", {"penetration_p95_mm": depth}, counters.env_steps)
         training = self._training_success()
-        row = [success, mean_return, _or_nan(depth), _or_nan(training)]
+        row = [success, mean_return, *(math.nan if value is None else value for value in (depth, training))]
         counters.curve.append([counters.env_steps, round(counters.wall_seconds, 2), *row])
         self.folder.write_curve(counters.curve)
         progress.say(
@@ -306,7 +314,6 @@ class Trainer:
             self._keep_as_best()
         reached = config.stop_success is not None and success >= config.stop_success
         counters.reached = counters.reached + 1 if reached else 0
-        return counters.reached >= 2
 
     def _keep_as_best(self) -> None:
         """Write the networks that act, without critics."""
@@ -381,13 +388,13 @@ class Trainer:
             unpack_optimisers(self.learner.optimisers, checkpoint.tensors)
             self.learner.set_counters(checkpoint.progress[LEARNER])
         self.counters = checked_counters(checkpoint.progress, path)
+        if checkpoint.config.total_steps < self.config.total_steps:  # asked to go on, however good it is
+            self.counters.reached = 0
         if self.counters.best is not None:
-            self._read_best()
+            best = self._read_best()
+            if best.progress["env_steps"] > self.counters.env_steps:  # written after the checkpoint, before a kill
+                self.counters.best = best.progress["best"]
         if replay is not None:
             replay.load(self.folder.replay, self.config.digest())
             replay.forget_old_files(self.folder.replay)  # those of a newer state, which was never finished
         self._resumed = checkpoint.tensors
-
-
-def _or_nan(value: float | None) -> float:
-    return float("nan") if value is None else value
