@@ -141,12 +141,13 @@ def test_a_policy_acts_in_its_own_task_with_another_preset():
 
 
 def test_maniskills_recording_holds_the_episodes_up_to_their_ends(tmp_path: Path):
+    """Whatever the folder is called."""
     source = find_source(ENV, "policy", "none")
-    made = record_dataset("maniskill", source, Plan(2, seed=5, num_envs=2), tmp_path / "out")
-    index = json.loads((tmp_path / "out/demonstrations.json").read_text())
-    own = json.loads((tmp_path / "out/recording.json").read_text())
+    made = record_dataset("maniskill", source, Plan(2, seed=5, num_envs=2), tmp_path / "out.h5")
+    index = json.loads((tmp_path / "out.h5/demonstrations.json").read_text())
+    own = json.loads((tmp_path / "out.h5/recording.json").read_text())
     assert index["env_info"]["env_id"] == f"dora:{ENV}"
-    with h5py.File(tmp_path / "out/demonstrations.h5") as file:
+    with h5py.File(tmp_path / "out.h5/demonstrations.h5") as file:
         assert len(file) == made.episodes == 2
         for k, (episode, row) in enumerate(zip(index["episodes"], own["episodes"], strict=True)):
             group: Any = file[f"traj_{k}"]

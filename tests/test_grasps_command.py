@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import mani_skill
 import numpy as np
@@ -121,10 +122,24 @@ def test_other_files_are_not_replaced(
     assert path.read_text() == '{"object": "mine"}'
 
 
+def test_searches_for_comparison_are_those_that_were_asked_for_less_a_part(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(grasps, "generate", lambda *given, name, kinematics: (name, kinematics, given[7]))
+    monkeypatch.setattr(grasps, "summary", lambda found: {"search": found})
+    obj, robot = load_object("cube"), load_robot("diana7_hit")
+    asked = Settings(seat=0.4, oversampling=3.0)
+    made = grasps.baselines(obj, robot, 3, 0, None, ProgressDisplay(), False, "compiled", asked)
+    found = {name: summary["search"] for name, summary in made.items()}
+    assert set(found) == set(grasps.BASELINES)
+    assert all(name == key and kind == "compiled" for key, (name, kind, _) in found.items())
+    assert {key: settings.seat for key, (_, _, settings) in found.items() if settings.seat} == {"no_closure": 0.4}
+    assert {settings.oversampling for *_, settings in found.values()} == {3.0}
+    assert found["no_closure"][2].weights.closure == 0 != found["unseated"][2].weights.closure
+
+
 def test_files_and_table(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ):
-    monkeypatch.setattr(grasps, "BASELINES", {name: QUICK for name in grasps.BASELINES})
+    monkeypatch.setattr(grasps, "BASELINES", {name: {"iterations": 1} for name in grasps.BASELINES})
     monkeypatch.setattr("dora.commands.grasps.Settings", lambda **_: QUICK)
     monkeypatch.setenv("COLUMNS", "200")  # headings are not wrapped
     out = tmp_path / "new" / "jug.safetensors"

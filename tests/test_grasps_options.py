@@ -132,6 +132,7 @@ def test_what_a_ranking_does_not_take_is_refused(
     [
         ("", ["baselines"]),
         ("--baselines 0", []),
+        ("--seat 0.4", ["baselines"]),
         ("--baselines 0 --validate sapien", ["voting"]),
         ("--validate sapien --by-region 5", ["baselines", "by_region", "voting"]),
     ],
@@ -153,19 +154,20 @@ def test_a_search_is_reported_with_what_was_asked_for_beside_it(
     monkeypatch.setattr(grasps, "hint", lambda failures, obj, assumed: f"hint {assumed}")
     monkeypatch.setattr(grasps, "by_region", lambda *given: {"base": given[2:5]})
     monkeypatch.setattr(grasps, "voting_summary", lambda found, obj: len(found))
-    monkeypatch.setattr(grasps, "baselines", lambda *given: given[2:5] + given[6:])
+    monkeypatch.setattr(grasps, "baselines", lambda *given: (*given[2:5], *given[6:8], given[8].seat))
     monkeypatch.setattr(grasps, "print_report", lambda report: None)
     monkeypatch.setattr(grasps, "write_report", lambda *given: written.append(given))
+    seat = 0.4 if "--seat" in words else Settings.seat
     assert call(grasps, monkeypatch, "--object", "jug", "--seed", "4", *words.split()) == 0
     out = Path("runs") / "grasps" / "jug.safetensors"
     assert capsys.readouterr().out.splitlines()[-1] == str(out)
     ((report, candidates, path),) = written
     assert (candidates, path) == ("the candidates", out)
-    assert searched["search"] == ("jug", 256, 4, "handle", simulated, Settings.seat, "compiled")
+    assert searched["search"] == ("jug", 256, 4, "handle", simulated, seat, "compiled")
     assert sorted(set(report) & {"baselines", "by_region", "voting"}) == entries
     assert report["failures"] == {"hint": "hint False"}
     assert report["kinematics"] == "compiled"
     if "baselines" in entries:
-        assert report["baselines"] == (64, 4, "handle", simulated, "compiled")
+        assert report["baselines"] == (64, 4, "handle", simulated, "compiled", seat)
     if "voting" in entries:
         assert report["voting"] == (2 if "by_region" in entries else 1)

@@ -2,6 +2,7 @@
 
 import shutil
 import tomllib
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,17 @@ def test_shapes_pads_and_inertias_are_images(right: RobotDescription, left: Robo
     for posture, image in zip(right.postures.values(), left.postures.values(), strict=True):
         np.testing.assert_array_equal(posture.arm, image.arm)
         np.testing.assert_array_equal(posture.hand, image.hand)
+
+
+def test_the_axis_of_a_slide_is_a_vector_and_a_missing_one_that_of_x():
+    """A slide along y goes the other way in the image, a hinge about x turns the other way."""
+    urdf = """<robot name="r"><joint name="a" type="prismatic"><axis xyz="0.6 0.8 0"/></joint>
+    <joint name="b" type="revolute"/><joint name="c" type="prismatic"/><joint name="d" type="fixed"/>
+    <joint name="e" type="revolute"><axis xyz="0.6 0.8 0"/></joint></robot>"""
+    image = ET.fromstring(mirrored_urdf(urdf, "s", "r"))
+    axes = {joint.get("name"): joint.find("axis") for joint in image.iter("joint")}
+    found = {name: axis is not None and [float(x) for x in axis.get("xyz", "").split()] for name, axis in axes.items()}
+    assert found == {"a": [0.6, -0.8, 0], "b": [-1, 0, 0], "c": [1, 0, 0], "d": False, "e": [-0.6, 0.8, 0]}
 
 
 def test_an_inertia_is_an_image():

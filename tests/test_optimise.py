@@ -101,14 +101,17 @@ def test_region_is_held(robot):
         optimise(load_object("jug"), robot, COUNT, seed=0, region="lid")
 
 
-def test_progress_reaches_its_end_unless_rows_settle(robot):
+@pytest.mark.parametrize(("field_size", "iterations"), [(1.0, 10), (2.0, 10), (2.0, 7), (1.3, 1)])
+def test_progress_reaches_its_end_unless_rows_settle(robot, field_size: float, iterations: int):
     seen = []
     optimise(
         load_object("cube"),
         robot,
         4,
         seed=0,
-        settings=Settings(iterations=10, starts=1, field_size=1.0, settle=1.0, oversampling=1.0),
+        settings=Settings(
+            iterations=iterations, starts=1, field_size=field_size, settle=1.0, oversampling=1.0, batch=3
+        ),
         progress=lambda done, total: seen.append((done, total)),
     )
     assert seen[-1][0] == seen[-1][1]

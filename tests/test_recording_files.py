@@ -48,6 +48,11 @@ def test_episodes_without_a_number_are_refused(tmp_path: Path, episode: Any):
         written(tmp_path, {"actions": ACTIONS}, episode)
 
 
+def test_the_module_of_a_users_task_is_no_part_of_its_id(tmp_path: Path):
+    found = written(tmp_path, {"actions": ACTIONS}, env_id="my_tasks.kitchen:DoraJug-v1")
+    assert found.env_id == "DoraJug-v1"
+
+
 @pytest.mark.parametrize(
     ("info", "options"),
     [

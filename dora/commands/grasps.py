@@ -196,7 +196,7 @@ def run(args: Args) -> None:
             report["voting"] = voting_summary([generated, *searches.values()], obj)
         if args.baselines:
             report["baselines"] = baselines(
-                obj, robot, args.baselines, args.seed, region, phases, simulate, args.kinematics
+                obj, robot, args.baselines, args.seed, region, phases, simulate, args.kinematics, settings
             )
     print_report(report)
     write_report(report, generated.candidates, out)

@@ -185,6 +185,7 @@ def _recorder(env: gym.Env, folder: Path, source: Source) -> Iterator[tuple[Reco
         source_desc=source.description,
     )
     recorder._h5_file.close()
+    recorder._json_path = str(folder / f"{NAME}.json")  # theirs replaces ".h5" in the whole path
     with ForgivingFile(folder / f"{NAME}.h5") as below:
         with h5py.File(below, "w") as recorder._h5_file:
             yield recorder, below

@@ -31,8 +31,6 @@ MOST_SEED = 2**32 - 1
 """Largest seed."""
 KEPT = ("guidance", "guidance_parts", "hand_joints", "preset", "config", "control_mode", "robot_uids")
 """Arguments of a task that say what its actions and states mean; the others are of the machine that recorded."""
-PREFIX = "dora:"
-"""What our ids begin with in a recording."""
 SUMS = ".sha256"
 """Ending of the file with the checksums of a trajectory file and of its index, which lies beside them."""
 MOST_SUMS = 10_000
@@ -87,7 +85,7 @@ class Recording:
         episodes = index.get("episodes") if isinstance(index, dict) else None
         if not isinstance(info, dict) or not isinstance(episodes, list) or not isinstance(info.get("env_id"), str):
             raise InputError(f"{index_path} is no index of a ManiSkill recording: name the .h5 file of one.")
-        env_id = info["env_id"].removeprefix(PREFIX)
+        env_id = info["env_id"].rpartition(":")[2]  # MODULE:ID opens it in gymnasium
         check_task_id(env_id)
         kwargs: Any = info.get("env_kwargs")
         kwargs = kwargs if isinstance(kwargs, dict) else {}

@@ -2,9 +2,9 @@
 
 The image is that in the plane y = 0 of the base. With S = diag(1, -1, 1) in the frame of every link, a transform T
 becomes S T S: a point (x, y, z) becomes (x, -y, z), the angles (roll, pitch, yaw) become (-roll, pitch, -yaw), the axis
-of a joint, which is a pseudovector, becomes (-x, y, -z), and the products of inertia with y change their sign. Joint
-angles keep their meaning, so limits, gains and postures stay as they are: with the same angles every frame of the image
-is S T S of the original's. "Right" and "left" are exchanged in names.
+of a rotation, which is a pseudovector, becomes (-x, y, -z), that of a slide (x, -y, z), and the products of inertia
+with y change their sign. Joint angles keep their meaning, so limits, gains and postures stay as they are: with the same
+angles every frame of the image is S T S of the original's. "Right" and "left" are exchanged in names.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from dora.files import make_folder, renew_checksums, write_bytes
 from dora.reading import read_text, read_toml
 from dora.robot.build import urdf_number
 from dora.robot.loading import NAME, ROBOT_FILE, load_robot
+from dora.robot.urdf import MOVING
 
 POINT, ANGLES, AXIS = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)
 """What the components of a point, of roll, pitch and yaw, and of an axis of rotation are multiplied by."""
@@ -68,12 +69,16 @@ def mirrored_urdf(text: str, name: str, source: str) -> str:
         root = ET.fromstring(text)
     except ET.ParseError as error:
         raise InputError(f"the URDF of {source!r} is no XML ({error}); correct it.") from error
+    for joint in root.iter("joint"):
+        if joint.get("type") in MOVING and joint.find("axis") is None:
+            ET.SubElement(joint, "axis", xyz="1 0 0")  # what a missing one means
+    slides = {axis for joint in root.iter("joint") if joint.get("type") == "prismatic" for axis in joint.iter("axis")}
     for element in root.iter():
         for key, value in element.attrib.items():
             if key in ("name", "link", "joint", "filename"):
                 element.set(key, mirrored_name(value))
         if element.tag in ("origin", "axis", "inertia"):
-            _mirror(element, source)
+            _mirror(element, source, POINT if element in slides or element.tag != "axis" else AXIS)
         if element.tag == "mesh" and _is_outside(element.get("filename", "")):
             raise InputError(
                 f"the mesh {element.get('filename')} lies outside the folder of {source!r}; move it there."
@@ -89,13 +94,13 @@ def _is_outside(filename: str) -> bool:
     return ":" in filename or ".." in filename or Path(filename).is_absolute()
 
 
-def _mirror(element: ET.Element, source: str) -> None:
-    """Mirrors the numbers of an origin, an axis or an inertia."""
+def _mirror(element: ET.Element, source: str, vector: tuple[float, float, float]) -> None:
+    """Mirrors the numbers of an origin, an axis or an inertia; `vector` are the factors of its `xyz`."""
     try:
         if element.tag == "inertia":
             for key in PRODUCTS:
                 element.set(key, urdf_number(-float(element.get(key, "0"))))
-        for key, factors in (("xyz", AXIS if element.tag == "axis" else POINT), ("rpy", ANGLES)):
+        for key, factors in (("xyz", vector), ("rpy", ANGLES)):
             if key in element.attrib:
                 values = zip(element.attrib[key].split(), factors, strict=True)
                 element.set(key, " ".join(urdf_number(float(value) * factor) for value, factor in values))

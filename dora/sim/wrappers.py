@@ -73,16 +73,16 @@ def _step_of_time_limit(original: Callable) -> Callable:
 def opening_module(env: BaseEnv) -> str | None:
     """The module whose import makes an environment known to gymnasium; None if ManiSkill alone does.
 
-    It is this package for its own tasks and robots and for everything on `physx_cpu_batch`, and otherwise the module
-    where a user's task is defined.
+    For environments of this package's tasks, with its robots or on `physx_cpu_batch`, it is the module where a user's
+    task is defined (which has to import this package), and for others this package.
     """
     agents = getattr(env.agent, "agents", [env.agent])
     module = type(env).__module__
-    ours = [cls for cls in type(env).__mro__ if cls.__module__.split(".")[0] == PACKAGE]
-    if ours and module.split(".")[0] not in (PACKAGE, "mani_skill", "__main__"):
-        return module
+    ours = any(cls.__module__.split(".")[0] == PACKAGE for cls in type(env).__mro__)
     described = any(isinstance(agent, DescribedRobot) for agent in agents)
-    return PACKAGE if ours or described or env.backend.sim_backend == BACKEND else None
+    if not (ours or described or env.backend.sim_backend == BACKEND):
+        return None
+    return PACKAGE if module.split(".")[0] in (PACKAGE, "mani_skill", "__main__") else module
 
 
 def _env_info(original: Callable) -> Callable:

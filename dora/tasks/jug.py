@@ -25,8 +25,7 @@ from dora.tasks.env.registration import register_task
 from dora.tasks.env.scene import TaskScene
 from dora.tasks.env.starts import STANDING_DRAWS, standing
 from dora.tasks.env.task import Task
-from dora.tasks.guidance.grasp_and_lift import GraspReference, GraspSettings
-from dora.tasks.guidance.reference import Reference
+from dora.tasks.guidance.grasp_and_lift import GraspSettings
 from dora.tasks.mdp.config import PenaltyWeights, TaskConfig
 from dora.tasks.mdp.mdp import Mdp, left_table
 from dora.tasks.mdp.memory import EpisodeMemory
@@ -162,9 +161,6 @@ class JugTask(Task):
 
     def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
         return best_candidates("jug", CLASS, self.config.fewest_lifts, self.config.most_candidates, region)
-
-    def make_reference(self, scene: TaskScene, arm: str) -> Reference:
-        return GraspReference(scene.num_envs, self.config.dt, scene.device, self.config.reference)
 
     def start_grid(self, arm: str) -> Grid:
         return Grid(self.config.centre, (self.config.spread,) * 2)

@@ -26,7 +26,7 @@ from dora.affordance.objects.signed_distance import CHANNELS, SignedDistanceFiel
 from dora.affordance.search.cache import forget
 from dora.affordance.search.compiled import CompiledDescent, CompiledEnergy
 from dora.affordance.search.descent import Rows, Schedule
-from dora.affordance.search.energies import GraspEnergy
+from dora.affordance.search.energies import GraspEnergy, Table
 from dora.affordance.search.initial_poses import InitialPoses
 from dora.affordance.search.native.parts import PARTS, repeat
 from dora.affordance.search.optimise import optimise, seated, table_of
@@ -165,16 +165,21 @@ def _measure(obj: AffordanceObject, robot: RobotDescription, settings: Settings)
     )
 
 
+def _table(obj: AffordanceObject) -> Table | None:
+    """The table of an object that stands on one, as `optimise` takes it."""
+    return table_of(obj) if obj.on_table else None
+
+
 def _search(obj: AffordanceObject, hand: HandModel, field: SignedDistanceField, settings: Settings) -> Search:
-    """What `optimise` searches with, on the object's table."""
-    energy = CompiledEnergy(hand, field, settings.weights, table_of(obj))
+    """What `optimise` searches with."""
+    energy = CompiledEnergy(hand, field, settings.weights, _table(obj))
     return Search(energy, InitialPoses(obj, hand, obj.target, settings.spread), settings)
 
 
 def _reference(obj: AffordanceObject, robot: RobotDescription, settings: Settings) -> float:
     """Seconds of an evaluation of one candidate with pytorch_kinematics and trimesh."""
     hand = ChainHand(robot)
-    energy = GraspEnergy(hand, PlainField(obj.solid), settings.weights, table_of(obj))
+    energy = GraspEnergy(hand, PlainField(obj.solid), settings.weights, _table(obj))
     search = Search(energy, InitialPoses(obj, hand, obj.target, settings.spread), replace(settings, starts=1))
     return _evaluation(search, REFERENCE_ROWS, REFERENCE_REPEATS)
 
@@ -186,7 +191,7 @@ def _by_faces(obj: AffordanceObject, search: Search, settings: Settings) -> dict
         start = time.process_time()
         field = SignedDistanceField(solid)
         filled = time.process_time() - start
-        energy = CompiledEnergy(search.energy.hand, field, settings.weights, table_of(obj))
+        energy = CompiledEnergy(search.energy.hand, field, settings.weights, _table(obj))
         rate = _evaluation(Search(energy, search.initial, settings), settings.batch)
         found[len(solid.faces)] = {"fill_seconds": filled, "evaluation_microseconds": 1e6 * rate}
         solid = solid.subdivide()

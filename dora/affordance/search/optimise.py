@@ -103,7 +103,7 @@ def optimise(
     search = Search(energy, initial, settings)
     wanted = math.ceil(num * settings.oversampling)
     sizes = [min(settings.batch, wanted - start) for start in range(0, wanted, settings.batch)]
-    done, total = 0, wanted * settings.iterations
+    done, total = 0, sum(map(search.work, sizes))
 
     def report(rows: int) -> None:
         nonlocal done

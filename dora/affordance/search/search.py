@@ -121,6 +121,13 @@ class Search:
         parts = hand.contact_part.unique().tolist()
         self._points = [(hand.contact_part == part).nonzero().squeeze(1) for part in parts]
 
+    def work(self, count: int) -> int:
+        """Row-iterations of the search for `count` candidates, of which `run` reports as many unless rows settle."""
+        settings = self.settings
+        halving = max(1, int(settings.halving * settings.iterations))
+        rest = max(settings.iterations - halving, 0)
+        return math.ceil(count * settings.field_size) * min(halving, settings.iterations) + count * rest
+
     def run(self, count: int, generator: torch.Generator, progress: Callable[[int], None]) -> Rows:
         """Search and return `count` candidates; `progress` is called with the candidate-iterations of each stretch."""
         settings, hand = self.settings, self.energy.hand

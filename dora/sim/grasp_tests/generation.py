@@ -32,14 +32,14 @@ MILLIMETRES = 1000.0
 """Millimetres per metre [1]."""
 _NO_CLOSURE = Weights(closure=0.0)
 """Weights of the energy without E_DFC."""
-BASELINES = {
-    "no_closure": Settings(weights=_NO_CLOSURE),
-    "unseated": Settings(seat=0.0),
-    "unseated_no_closure": Settings(weights=_NO_CLOSURE, seat=0.0),
-    "unseated_one_iteration": Settings(iterations=1, seat=0.0),
+BASELINES: dict[str, dict[str, Any]] = {
+    "no_closure": {"weights": _NO_CLOSURE},
+    "unseated": {"seat": 0.0},
+    "unseated_no_closure": {"weights": _NO_CLOSURE, "seat": 0.0},
+    "unseated_one_iteration": {"iterations": 1, "seat": 0.0},
 }
-"""Settings of searches for comparison, each without one part: without E_DFC; without closing the hand around the object
-after the search (`unseated`); without both; with a single iteration."""
+"""Changed settings of searches for comparison, each without one part: without E_DFC; without closing the hand around
+the object after the search (`unseated`); without both; with a single iteration."""
 
 
 CANDIDATE, MAP, CLOSED = "candidate", "contact_map", "closed_hand"
@@ -172,14 +172,16 @@ def baselines(
     phases: ProgressDisplay,
     simulate: bool = True,
     kinematics: str = "compiled",
+    settings: Settings | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Summaries of searches with the settings in `BASELINES`, by name; arguments as for `generate`."""
-    return {
-        name: summary(
-            generate(obj, robot, num, seed, region, phases, simulate, settings, name=name, kinematics=kinematics)
+    """Summaries of searches that differ from `settings` by `BASELINES`, by name; arguments as for `generate`."""
+    found = {}
+    for name, changes in BASELINES.items():
+        changed = replace(settings or Settings(), **changes)
+        found[name] = summary(
+            generate(obj, robot, num, seed, region, phases, simulate, changed, name=name, kinematics=kinematics)
         )
-        for name, settings in BASELINES.items()
-    }
+    return found
 
 
 def by_region(

@@ -19,7 +19,7 @@ from dora.sim.shapes import DrawnShape
 from dora.tasks.env.arm import Arm, ArmSpec
 from dora.tasks.env.starts import STANDING_DRAWS, ChosenStarts, standing_starts
 from dora.tasks.env.table import TableTop, table_shapes
-from dora.tasks.guidance.grasp_and_lift import GraspReference
+from dora.tasks.guidance.grasp_and_lift import GraspReference, GraspSettings
 from dora.tasks.guidance.reference import Reference
 from dora.tasks.mdp.config import TaskConfig
 from dora.tasks.mdp.mdp import Mdp
@@ -122,8 +122,11 @@ class Task(ABC):
         return [scene.table]
 
     def make_reference(self, scene: "TaskScene", arm: str) -> Reference:
-        """What leads the hand of an arm along its chosen candidate; called once per scene."""
-        return GraspReference(scene.num_envs, self.config.dt, scene.device)
+        """What leads the hand of an arm along its chosen candidate; called once per scene. By default a grasp, with the
+        numbers of the configuration's `reference` if it has them."""
+        given = getattr(self.config, "reference", None)
+        settings = given if isinstance(given, GraspSettings) else GraspSettings()
+        return GraspReference(scene.num_envs, self.config.dt, scene.device, settings)
 
     def start_grid(self, arm: str) -> Grid | None:
         """Where the object of an arm may stand at the start, for the table of f_reach; None where it does not stand."""
