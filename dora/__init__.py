@@ -5,7 +5,7 @@ with ManiSkill, and adds `sim_backend="physx_cpu_batch"` to all tasks:
 
     import gymnasium as gym, dora
     env = gym.make("DoraCube-v1", num_envs=32, sim_backend="physx_cpu_batch", guidance="affordance")
-    env = gym.make("Empty-v1", robot_uids="diana7_hit")
+    env = gym.make("Empty-v1", robot_uids="diana7_hit", render_backend="none")
 
 A trained policy comes with each task: `action = dora.load_policy("DoraCube-v1")(obs)`.
 """

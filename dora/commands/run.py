@@ -84,7 +84,7 @@ class Args(Generic[Numbers, Settings, Agent]):
     """Checkpoint to evaluate: a .safetensors file, a run folder for its best one, or a folder of a stored result."""
     collector: Literal["processes", "ray"] = "processes"
     """Where workers collect: in processes of this machine, or in actors of the Ray cluster at RAY_ADDRESS, one core
-    each (without that variable, of one on this machine alone; needs `pip install ray`)."""
+    each (without that variable, of the one on this machine, or of a new one; needs `pip install ray`)."""
     video: bool = False
     """Film a few episodes of the policy, after training or before evaluation (needs a Vulkan driver)."""
     first_seed: Annotated[int, tyro.conf.Suppress] = FINAL_SEED

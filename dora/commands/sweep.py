@@ -47,7 +47,7 @@ class Args:
     launcher: Literal["local", "ray"] = "local"
     """Train on this machine, or as tasks of a Ray cluster (`pip install ray`)."""
     address: str | None = None
-    """Of the Ray cluster; a cluster of this machine alone if there is none."""
+    """Of the Ray cluster; without it the one on this machine, or a new one there."""
     jobs: int = 1
     """Runs at the same time; with Ray, 0 is as many as the cluster has cores for."""
     retries: int = 1

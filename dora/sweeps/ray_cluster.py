@@ -39,8 +39,8 @@ class RayLauncher(Launcher):
     """Runs as tasks of a Ray cluster.
 
     Args:
-        address: of the cluster; without one, that of the environment variable RAY_ADDRESS, else a cluster of this
-            machine alone is started.
+        address: of the cluster; without one, that of the environment variable RAY_ADDRESS, else the one that `ray
+            start` has started on this machine, else a new one of this machine alone.
         cores: that a run takes.
         command: words of the process that trains in a folder.
 

@@ -242,7 +242,7 @@ def terms(c: CubeConfig) -> Terms[Snapshot]:
             ),
             "lift": Term(
                 lambda s: torch.where(s.stage >= LIFT, lift(s), 0.0), w.lift,
-                doc="rise, saturating at the target height, once it is grasped",
+                doc="rise, saturating at the target height, once it is grasped; less without thumb and finger",
             ),
             "held": Term(
                 clean, w.held,

@@ -30,7 +30,7 @@ from dora.tools.episodes import play_out
 BATCH = 50
 """Episodes that run together."""
 SEED = 30_000
-"""First seed; training, evaluation and ranking use none of these."""
+"""First seed; training and evaluation use none of these."""
 HEAD = ("candidates, action", "success", "overlap not counted", "size of the action")
 """Head of the table."""
 Act = Callable[[DoraEnv], Float[Tensor, "n a"]]

@@ -32,7 +32,8 @@ def ray_collector(
 ) -> Any:
     """A collector whose workers, one for each seed, are actors of a Ray cluster; each takes one core.
 
-    The cluster is that of the environment variable RAY_ADDRESS, else one of this machine alone.
+    The cluster is that of the environment variable RAY_ADDRESS, else the one that `ray start` has started on this
+    machine, else a new one of this machine alone.
 
     Args:
         make_task: makes one task batch; called once in each worker.

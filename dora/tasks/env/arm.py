@@ -182,7 +182,8 @@ class Arm:
 def tabulated_reach(arm: Arm, grid: Grid, candidates: GraspCandidates) -> ReachTable:
     """f_reach of candidates of an arm over a grid of places, made once and cached on disk.
 
-    The motions are those of the arm's controller and reference in its task.
+    The motions have the period of the task and the descent and hover of the arm's reference; the other numbers are
+    the defaults of `ReachSettings` and `Controller`, also where the task's own differ.
     """
     obj, reference = load_object(arm.spec.object), arm.guide.reference
     reach = Reach(

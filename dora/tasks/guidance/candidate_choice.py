@@ -28,7 +28,7 @@ UNRANKED, UNREACHABLE = 1e3, 1e6
 class CandidateChoice:
     """The candidates in use, one row per environment; poses in the object frame, the error included.
 
-    All k candidates of an environment have the same error, as a misplaced object frame would cause.
+    All k candidates of an environment have the same error: a shift in the object frame, a turn about the wrist, joints.
 
     Attributes:
         error_scale: share of the randomisation's candidate error in force, for curricula.
@@ -78,7 +78,7 @@ class CandidateChoice:
         """Gives the environments `rows` the candidates `index`, with an error as `randomisation` says.
 
         `error`: `error_draws` independent uniform numbers in [-1, 1]: 3 for position, 3 for rotation, then joints;
-        `reachable` says whether the first candidate can be reached.
+        `reachable` says whether any candidate can be reached.
         """
         c, first, error = self.candidates, index[:, 0], self.error_scale * error
         tilt = quaternion_from_rotation_vector(randomisation.candidate_rotation * error[:, 3:6])

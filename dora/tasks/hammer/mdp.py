@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 CATCH, STABILISE, HELD = range(3)
 """Indices of the first stages, and of the one in which the hammer is held."""
+DONE = "; 1 once all stages are done"
+"""End of the meaning of terms that pay until the end of the episode."""
 
 
 def strike_stage(c: "HammerConfig") -> int:
@@ -110,11 +112,12 @@ def terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
                 "closeness of the wrist to the candidate until the hammer is held",
             ),
             "catch": Term(catch, w.catch, doc="handle near the middle of the hand, and fingers on it"),
-            "still": Term(still, w.still, doc="the hammer does not move in the hand"),
-            **({"turn": Term(turn, c.turn.weight, doc="share of the turn in the hand")} if c.in_hand_turn else {}),
+            "still": Term(still, w.still, doc=f"the hammer does not move in the hand{DONE}"),
+            **({"turn": Term(turn, c.turn.weight, doc=f"share of the turn in the hand{DONE}")} if c.in_hand_turn else {}),
             "orient": Term(
                 orient, w.orient,
-                doc="closeness of theta, the angle from striking axis to nail axis, and of the face to the nail",
+                doc="from the stage orient on, closeness of theta, the angle from striking axis to nail axis, and of the "
+                f"face to the nail{DONE}",
             ),
             "strike": Term(
                 strike, w.strike,

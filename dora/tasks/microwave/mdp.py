@@ -93,7 +93,8 @@ class MicrowaveConfig(TaskConfig):
     """Numbers of the task."""
 
     definition: Annotated[int, tyro.conf.Suppress] = 2
-    """2: the door is opened by a finger on the handle, and the cube is left with both hands outside (November 2026)."""
+    """2: the door is opened by a finger on the handle, and the cube is left with both wrists and the right fingertips
+    outside (November 2026)."""
     PRESETS: ClassVar[Any] = {
         "none": MicrowaveRandomisation(),
         "standard": MicrowaveRandomisation(

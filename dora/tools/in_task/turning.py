@@ -57,7 +57,7 @@ FALL, SAME_STARTS, CLEAN = 0.3, 6, 0.8
 """Longest fall of a hammer [s], generations that begin with the same caught hammers, and share of the limit of overlap
 that costs nothing [1]."""
 SEED = 50_000
-"""First seed; training, evaluation and ranking use none of these."""
+"""First seed; training and evaluation use none of these."""
 
 
 @dataclass
