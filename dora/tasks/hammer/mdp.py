@@ -113,11 +113,11 @@ def terms(c: "HammerConfig") -> Terms[HammerSnapshot]:
             ),
             "catch": Term(catch, w.catch, doc="handle near the middle of the hand, and fingers on it"),
             "still": Term(still, w.still, doc=f"the hammer does not move in the hand{DONE}"),
-            **({"turn": Term(turn, c.turn.weight, doc=f"share of the turn in the hand{DONE}")} if c.in_hand_turn else {}),
+            **({"turn": Term(turn, c.turn.weight, doc=f"share of the turn{DONE}")} if c.in_hand_turn else {}),
             "orient": Term(
                 orient, w.orient,
-                doc="from the stage orient on, closeness of theta, the angle from striking axis to nail axis, and of the "
-                f"face to the nail{DONE}",
+                doc="from the stage orient on, closeness of theta, the angle from striking axis to nail axis, and of "
+                f"the face to the nail{DONE}",
             ),
             "strike": Term(
                 strike, w.strike,
