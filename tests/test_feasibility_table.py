@@ -1,11 +1,14 @@
 """The table of the feasibility filter."""
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from placements import clear_grasps, grasps, scattered, standing
 
+from dora.affordance.objects.affordance_object import Piece
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.approach_paths import ReachSettings
 from dora.affordance.reach.feasibility import Reach
@@ -100,3 +103,19 @@ def test_a_table_is_made_anew_when_a_number_changes_on_which_motions_depend(robo
     else:
         monkeypatch.setitem(inverse_kinematics.NUMBERS, "largest_step", 0.5)
     assert digest(**numbers) != before
+
+
+@pytest.mark.parametrize("name", ["cube", "jug"])
+def test_a_table_is_made_anew_when_a_collision_shape_changes(robot, name: str):
+    """A primitive (cube) and a hull (jug), of the same surface: by a tenth of a millimetre, and not by rounding."""
+    obj, grid = load_object(name), Grid((0.45, 0.0), (0.05, 0.05), spacing=0.05, yaws=24)
+    candidates = grasps(robot, obj, 4)
+
+    def digest(*pieces: Piece) -> str:
+        return table_digest(Reach(robot, replace(obj, pieces=pieces)), candidates, grid, obj.support, obj.rest)
+
+    first, *rest = obj.pieces
+    same = digest(first, *rest)
+    assert digest(first.moved(np.array([1e-12, 0.0, 0.0])), *rest) == same
+    assert digest(first.moved(np.array([1e-4, 0.0, 0.0])), *rest) != same
+    assert digest(first, first, *rest) != same

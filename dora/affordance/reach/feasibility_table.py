@@ -11,8 +11,11 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+import trimesh
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
@@ -31,11 +34,14 @@ from dora.geometry.rotations import (
     yaw_of,
 )
 from dora.robot.motion import inverse_kinematics
+from dora.robot.shapes import Shape
 
 FORMAT = "dora-reach 1"
 """Format and version of a stored table; the version changes when the filter decides differently."""
 CHUNK = 4096
 """Rows (pairs of pose and candidate) that are filtered at once; bounds the memory."""
+DIGITS = 6
+"""Decimals with which the numbers of a piece, in metres, count in the digest."""
 MAX_TILT = 0.1
 """Largest tilt from the resting orientation for which the table holds [rad]."""
 MAX_RISE = 0.02
@@ -246,6 +252,7 @@ def table_digest(
             "kinematics": inverse_kinematics.NUMBERS,
             "base": reach.base,
             "object": reach.digest,
+            "pieces": [_described(piece) for piece in reach.pieces],
             "grid": grid,
             "height": height,
             "rest": rest,
@@ -256,6 +263,14 @@ def table_digest(
             "candidates": {name: getattr(candidates, name).cpu() for name in names},
         }
     )
+
+
+def _described(piece: Shape | trimesh.Trimesh) -> dict[str, Any]:
+    """A convex piece, to a micrometre: sums of floats differ between machines by less."""
+    if isinstance(piece, Shape):
+        numbers = np.array([*piece.position, *piece.quaternion, *piece.size])
+        return {"kind": piece.kind, "numbers": np.round(numbers, DIGITS) + 0.0}
+    return {"vertices": np.round(piece.vertices, DIGITS) + 0.0, "faces": np.array(piece.faces, np.int64)}
 
 
 def poses(

@@ -194,7 +194,14 @@ def _aggregated(cells: Mapping[Cell, list[Run]]) -> list[Section]:
         return [Section("Over tasks 1 to 3", ("",), [["needs rliable: pip install rliable 'pandas<3'"]])]
     rows = [[name, str(len(scores[name])), *(with_interval(*pair) for pair in both)] for name, both in found.items()]
     head = ("learner, guidance", "seeds", "mean %", "interquartile mean %")
-    return [Section("Over tasks 1 to 3", head, rows, "By rliable, stratified bootstrap over seeds.")]
+    return [
+        Section(
+            "Over tasks 1 to 3",
+            head,
+            rows,
+            "By rliable, stratified bootstrap over the seeds that all three tasks have.",
+        )
+    ]
 
 
 def _differences(runs: Sequence[Run]) -> Section:
