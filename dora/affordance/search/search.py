@@ -123,17 +123,20 @@ class Search:
 
     def work(self, count: int) -> int:
         """Row-iterations of the search for `count` candidates, of which `run` reports as many unless rows settle."""
-        settings = self.settings
-        halving = max(1, int(settings.halving * settings.iterations))
-        rest = max(settings.iterations - halving, 0)
-        return math.ceil(count * settings.field_size) * min(halving, settings.iterations) + count * rest
+        settings, halving = self.settings, self._halving
+        return math.ceil(count * settings.field_size) * halving + count * (settings.iterations - halving)
+
+    @property
+    def _halving(self) -> int:
+        """Iterations after which only the best rows stay."""
+        return max(1, int(self.settings.halving * self.settings.iterations))
 
     def run(self, count: int, generator: torch.Generator, progress: Callable[[int], None]) -> Rows:
         """Search and return `count` candidates; `progress` is called with the candidate-iterations of each stretch."""
         settings, hand = self.settings, self.energy.hand
         rows = self.start(math.ceil(count * settings.field_size), generator)
         last = settings.iterations
-        halving = max(1, int(settings.halving * last))
+        halving = self._halving
         resampling = range(settings.resample, math.ceil(settings.resample_until * last), settings.resample)
         checks = range(CHECK * (1 + int(settings.settle * last) // CHECK), last, CHECK)
         finished = []
