@@ -15,7 +15,7 @@ from fake_task import PointMass
 from torch import Tensor
 
 from dora.agents.config import PPOConfig, RunConfig
-from dora.agents.evaluation.evaluate import FINAL_SEED, MOST_SEEDS, PERIODIC_SEED, STARTS, first_seed
+from dora.agents.evaluation.evaluate import FINAL_SEED, MOST_SEEDS, PERIODIC_SEED, STARTS, Evaluation, first_seed
 from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.learner import make_learner
 from dora.agents.seeds import TRAINING_SEEDS
@@ -64,6 +64,40 @@ class FailsElsewhere(PointMass):
 def helpers() -> list[BaseProcess]:
     """Helper processes of this one that have not ended."""
     return multiprocessing.active_children()
+
+
+class Threads(PointMass):
+    """A task that notes on how many threads torch computes while it is stepped."""
+
+    seen: ClassVar[set[int]] = set()
+
+    def step(self, action: Tensor) -> Any:
+        self.seen.add(torch.get_num_threads())
+        return super().step(action)
+
+
+def test_a_machine_of_more_cores_gives_the_same_rows():
+    """A product of matrices on four threads is rounded otherwise than on one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(4)
+    try:
+        Evaluators(Threads, dataclasses.replace(CONFIG, workers=0)).run(None, EPISODES, 0)
+        assert Threads.seen == {1}
+        assert torch.get_num_threads() == 4
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_a_share_is_reached_by_the_count_of_episodes():
+    """The rate of 95 successes in 100 is .94999999 in float32."""
+    evaluators = Evaluators(PointMass, CONFIG)
+    columns, width = evaluators.env.columns, len(evaluators.env.columns.names)
+    for count, share in ((95, 0.95), (90, 0.9), (48, 0.48), (0, 0.0), (100, 1.0)):
+        table = torch.zeros(100, width)
+        columns.column(table, "success")[:count] = 1.0
+        assert Evaluation(columns, table).reaches(share)
+        assert not Evaluation(columns, table).reaches(share + 0.005)
+    evaluators.close()
 
 
 def test_processes_give_the_rows_of_one_process():

@@ -75,6 +75,12 @@ def parts_of(learner: MultiAgentPPO, batch: TensorDict) -> list[TensorDict]:
     )
 
 
+def test_without_samples_of_a_normaliser_the_first_batch_is_learned_from():
+    learner = MultiAgentPPO(BOTH["mappo"], *SIZES, 0, AGENTS)
+    assert "policy/left" in learner.update(batch_of(learner))
+    assert learner.normaliser.count == 0
+
+
 # ---- the policy ----------------------------------------------------------------------------------
 
 

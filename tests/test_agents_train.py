@@ -131,6 +131,23 @@ def test_same_seed_same_run_and_other_seed_another(tmp_path: Path):
     assert not torch.equal(a, c)
 
 
+@pytest.mark.parametrize(("total", "evaluated"), [(1024, [512, 1024]), (1280, [512, 1024, 1280]), (256, [])])
+def test_the_end_of_a_budget_is_evaluated_if_anything_was(tmp_path: Path, total: int, evaluated: list[int]):
+    run(tmp_path / "run", dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=total, eval_every=512))
+    curve = tmp_path / "run" / "curve.csv"
+    lines = curve.read_text().splitlines()[1:] if curve.exists() else []
+    assert [int(line.partition(",")[0]) for line in lines] == evaluated
+
+
+def test_without_samples_of_a_normaliser_observations_are_learned_from_as_they_are(tmp_path: Path):
+    for steps in (256, 512):
+        config = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=steps, normaliser_samples=0)
+        run(tmp_path / str(steps), config)
+    first, second = (weights(tmp_path / str(steps)) for steps in (256, 512))
+    assert float(second["normaliser/count"]) == 0.0
+    assert not torch.equal(first["actor/mean.0.weight"], second["actor/mean.0.weight"])
+
+
 def test_resume_refuses_other_settings(tmp_path: Path):
     config = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=512)
     run(tmp_path / "run", config)

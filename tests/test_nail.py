@@ -28,6 +28,8 @@ from dora.tasks.hammer.task import HammerConfig, HammerTask
 
 CONFIG = HammerConfig()
 """The task's own numbers."""
+HEAD_SIDE = 0.011
+"""Radius of the hammer's head beside the face [m]."""
 
 
 @pytest.fixture(scope="module")
@@ -270,6 +272,20 @@ def test_a_blow_with_the_handle_is_no_blow(bench: tasks.DoraEnv):
     bench.target_object.set_pose(Pose.create_from_pq(place[None] - middle, flat))
     bench.target_object.set_linear_velocity(torch.tensor([[0.0, 0.0, -1.6]]))
     depth, driven = run(bench, 6)
+    assert depth > 0.5
+    assert driven == 0.0
+
+
+@pytest.mark.parametrize(("behind", "speed"), [(0.007, 1.6), (0.002, 1.3), (0.002, 0.7)])
+def test_a_blow_with_the_side_of_the_head_is_no_blow(bench: tasks.DoraEnv, behind: float, speed: float):
+    """Upside down, and so near to the edge of the face [m] that the contact is within what belongs to the face."""
+    over_nail(bench, 0.01, 0.0)
+    upside_down = torch.tensor([[0.0, 1.0, 0.0, 0.0]])  # half a turn about x, the striking axis
+    edge = bench.task.points["face"] + torch.tensor([[-behind, 0.0, HEAD_SIDE]])
+    place = torch.tensor(CONFIG.nail.top) + torch.tensor([0.0, 0.0, 0.01]) - quaternion_apply(upside_down, edge)
+    bench.target_object.set_pose(Pose.create_from_pq(place, upside_down))
+    bench.target_object.set_linear_velocity(torch.tensor([[0.0, 0.0, -speed]]))
+    depth, driven = run(bench, 5)
     assert depth > 0.5
     assert driven == 0.0
 

@@ -132,6 +132,8 @@ def test_a_run_of_ones_own_is_loaded_by_its_path(tmp_path: Path) -> None:
         ({"hand_joints": 15}, "control mode"),
         ({"obs_mode": "state_dict"}, "hold no plain state"),
         ({"config": {"residual": {"joint": 0.2}}}, r"config\.residual"),
+        ({"config": {"wrist_speed": 0.4}}, r"config\.wrist_speed 1\.0, and the environment has 0\.4"),
+        ({"config": {"hand_speed": 0.3}}, r"config\.hand_speed"),
         ({"config": {"optimised": True}}, r"config\.optimised False"),
     ],
 )
@@ -143,6 +145,13 @@ def test_an_environment_of_another_kind_is_refused(options: dict, said: str | No
     else:
         with pytest.raises(InputError, match=said):
             policy.check(env)
+    env.close()
+
+
+def test_an_environment_in_which_a_correction_is_a_larger_one_is_refused() -> None:
+    env = gym.make("DoraHammer-v1", config={"reference": {"held_freedom": 1.0}})
+    with pytest.raises(InputError, match=r"config\.reference\.held_freedom 0\.2, and the environment has 1\.0"):
+        dora.load_policy("DoraHammer-v1").check(env)
     env.close()
 
 

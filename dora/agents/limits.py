@@ -47,7 +47,7 @@ LEARNER = {
     "n_step": (1, 10_000),
     "warmup": (0, 10**12),
     "critic_only": (0, 10**12),
-    "gamma": SHARE,
+    "gamma": (0, 1 - 1e-6),  # rewards are learned times 1 - gamma
     "gae_lambda": SHARE,
     "polyak": SHARE,
     "noise_correlation": (0, 1 - 1e-9),
@@ -75,7 +75,10 @@ LEARNER = {
     "log_std_max": (-30, 10),
 }
 """Lowest and highest value of the settings of learners."""
-EARLIER = {"final_episodes": (1, 10**6), "eval_episodes": (1, 100_000), "log_std": (-30, 10), "log_std_min": (-30, 10)}
+EARLIER = {
+    "final_episodes": (1, 10**6), "eval_episodes": (1, 100_000), "log_std": (-30, 10), "log_std_min": (-30, 10),
+    "gamma": SHARE,
+}  # fmt: skip
 """Wider ranges of earlier versions, whose files can be read still."""
 ORDERED = (
     ("learning_rate_min", "learning_rate_max"), ("log_std_min", "log_std"), ("log_std_last", "log_std"),

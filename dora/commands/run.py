@@ -130,6 +130,8 @@ def parse(words: Sequence[str]) -> Args[dict[str, Any], Any, str]:
     check(config, stored=first.resume is not None or first.checkpoint is not None)
     guidance_in_force(config.guidance, config.guidance_parts)
     if not args.eval_only:
+        if args.collector == "ray" and config.workers == 0:
+            raise InputError("--collector ray needs workers, and --workers is 0: give 1 or more, or leave it out.")
         return replace(args, run=config)
     if config.final_episodes != base.final_episodes:
         check_episodes(config.final_episodes)

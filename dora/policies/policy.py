@@ -15,7 +15,7 @@ from dora import registration as registration
 from dora.agents.checkpoint import Checkpoint, read_checkpoint
 from dora.agents.evaluation.play import checkpoint_path
 from dora.agents.evaluation.play import load_policy as networks_of
-from dora.configs import plain
+from dora.configs import flat, plain
 from dora.errors import InputError, shown
 from dora.policies.card import Card
 from dora.sim.robot_agent import CONTROL_MODES, FINGERS
@@ -26,8 +26,9 @@ from dora.tasks.mdp.guidance_parts import GUIDANCE, OBSERVATION, PRIOR, REGION, 
 
 BUNDLED = Path(__file__).parent / "bundled"
 """Folder of the policies that come with Dora: a checkpoint and a card for each task."""
-COMPARED = ("control_frequency", "residual")
-"""Numbers of a task that say what an action means; switches, which are true, false or a word, are compared as well."""
+COMPARED = ("control_frequency", "residual", "wrist_speed", "hand_speed", "reference.held_freedom")
+"""Numbers of a task that say how far an action moves the hand; switches, which are true, false or a word, are compared
+as well."""
 
 
 class TaskPolicy:
@@ -181,7 +182,9 @@ def _words(parts: frozenset[str]) -> str:
 
 def _meaning(numbers: dict[str, Any]) -> dict[str, Any]:
     """Of the numbers of a task those that say what an action means, and its switches."""
-    return {f"config.{n}": v for n, v in numbers.items() if n in COMPARED or isinstance(v, bool | str)}
+    named = {n: v for n, v in numbers.items() if n in COMPARED or isinstance(v, bool | str)}
+    deeper = {n: v for n, v in flat(numbers) if n in COMPARED}
+    return {f"config.{n}": v for n, v in (named | deeper).items()}
 
 
 def bundled_files(env_id: str) -> tuple[Path, Path]:

@@ -13,7 +13,7 @@ from dora.agents.config import RunConfig
 from dora.agents.evaluation.evaluate import FINAL_SEED, Act, Evaluation, no_correction, run_batch
 from dora.agents.learners.learner import make_learner
 from dora.agents.learners.networks import Policy
-from dora.parallel import PATIENCE, WorkerPool
+from dora.parallel import PATIENCE, WorkerPool, one_thread
 
 FEWEST = 2
 """Environments of the smallest batch [1]: sums over a single one are rounded in another order."""
@@ -28,7 +28,7 @@ class Evaluators:
     """Evaluates policies in this process and in helpers, which start when there is something to do for them.
 
     Batches have `config.eval_envs` episodes, the last one those that are left. An episode gives the same row in
-    whatever process it runs, and however many others there are.
+    whatever process it runs, however many others there are, and however many cores the machine has.
 
     Args:
         make_task: makes a batch of tasks; picklable.
@@ -111,7 +111,7 @@ class _Evaluator:
             check()
             return act(observation)
 
-        with torch.random.fork_rng(devices=[]):
+        with one_thread(), torch.random.fork_rng(devices=[]):  # products on more threads are rounded otherwise
             return run_batch(env, checked, seed)[:episodes].numpy(force=True)
 
     def _greedy(self, weights: Weights, env: TaskEnv) -> Act:

@@ -87,7 +87,7 @@ class MultiAgentPPO:
 
         The very first batch only sets the normaliser, as in PPO.
         """
-        if self.normaliser.count == 0:
+        if self.normaliser.count == 0 and not self.normaliser.frozen:
             self.normaliser.update(batch["observation"])
             return {}
         self.steps += batch.numel()

@@ -90,7 +90,7 @@ class PPO:
 
         The very first batch only sets the normaliser, since unscaled observations would teach nothing good.
         """
-        if self.normaliser.count == 0:
+        if self.normaliser.count == 0 and not self.normaliser.frozen:
             self.normaliser.update(batch["observation"])
             return {}
         self.steps += batch.numel()

@@ -281,7 +281,10 @@ class Trainer:
         self._table.add({"env_steps": step, "seconds": counters.wall_seconds, "episodes": len(ended)} | means)
 
     def _evaluation_is_due(self) -> bool:
-        return self.counters.env_steps >= self.counters.next_evaluation
+        """At each multiple of `eval_every`, and at the end of a budget that is none."""
+        steps, curve = self.counters.env_steps, self.counters.curve
+        at_end = steps >= self.config.total_steps and len(curve) > 0 and curve[-1][0] < steps
+        return at_end or steps >= self.counters.next_evaluation
 
     def _evaluate(self, log: RunLog, progress: ProgressDisplay, interrupt: Interrupt) -> None:
         """Evaluate, and keep the policy if it is the best so far."""
@@ -295,14 +298,11 @@ class Trainer:
         while counters.next_evaluation <= counters.env_steps:
             counters.next_evaluation += config.eval_every
         self._last_evaluation = evaluation
-        success, mean_return = evaluation.success_rate, evaluation.return_mean
-        depth = evaluation.penetration_p95_mm
-        log.add("evaluation", {"success_rate": success, "return_mean": mean_return}, counters.env_steps)
+        success, mean_return, depth = evaluation.success_rate, evaluation.return_mean, evaluation.penetration_p95_mm
+        measured = {"success_rate": success, "return_mean": mean_return}
+        log.add("evaluation", measured | ({} if depth is None else {"penetration_p95_mm": depth}), counters.env_steps)
         log.add("evaluation/stage", evaluation.stage_rates, counters.env_steps)
-        if depth is not None:
-            log.add("evaluation", {"penetration_p95_mm": depth}, counters.env_steps)
-        training = self._training_success()
-        row = [success, mean_return, *(math.nan if value is None else value for value in (depth, training))]
+        row = [success, mean_return, *(math.nan if x is None else x for x in (depth, self._training_success()))]
         counters.curve.append([counters.env_steps, round(counters.wall_seconds, 2), *row])
         self.folder.write_curve(counters.curve)
         progress.say(
@@ -312,7 +312,7 @@ class Trainer:
         if counters.best is None or [success, mean_return] > counters.best:
             counters.best = [success, mean_return]
             self._keep_as_best()
-        reached = config.stop_success is not None and success >= config.stop_success
+        reached = config.stop_success is not None and evaluation.reaches(config.stop_success)
         counters.reached = counters.reached + 1 if reached else 0
 
     def _keep_as_best(self) -> None:

@@ -51,6 +51,8 @@ FACE_DEPTH, FACE_EDGE = 0.006, 0.003
 point of a contact lies between the two surfaces, which a blow presses into each other."""
 UPRIGHT = 0.7
 """Smallest vertical share of a contact's normal that presses the nail down, not aside [1]."""
+SQUARE = 0.7
+"""Smallest share along the striking axis of the normal of a contact on the face; the head's side lies across it [1]."""
 STATE = ("_depth", "_driven", "_since", "_speed", "_before", "_sinking", "_reach", "_left", "_held")
 """Buffers of a nail that its state holds."""
 DOWN = (0.7071068, 0.0, 0.7071068, 0.0)
@@ -245,7 +247,7 @@ class Nail:
     def _on_face(self, i: int, point: sapien.physx.PhysxContactPoint) -> bool:
         """Whether a contact point of hammer and nail was on the striking face, and pressed the nail down."""
         pose = self._poses[i]
-        if pose is None or abs(point.normal[2]) < UPRIGHT:
+        if pose is None or abs(point.normal[2]) < UPRIGHT or abs(pose[:3, 0] @ point.normal) < SQUARE:
             return False
         away = pose[:3, :3].T @ (point.position - pose[:3, 3]) - self._faces[i]
         deep = FACE_DEPTH + max(float(self._speed[i]), 0.0) * self._dt  # the face goes on in the step of the impact
