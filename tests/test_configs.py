@@ -2,10 +2,13 @@
 
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
+from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
+from mani_skill.utils.structs.types import SimConfig
 
 import dora
 from dora.agents.runs.recommended import recommended
@@ -230,9 +233,16 @@ def test_thresholds_weights_and_rates_are_in_force():
         env.close()
 
 
-def test_the_rates_of_a_sim_config_are_those_of_the_task():
+@pytest.mark.parametrize(
+    "rates",
+    [
+        {"sim_freq": 120, "control_freq": 60, "scene_config": {"bounce_threshold": 1.0}},
+        {"sim_freq": np.int64(120), "control_freq": np.int32(60)},
+        SimConfig(sim_freq=120, control_freq=60),
+    ],
+)
+def test_the_rates_of_a_sim_config_are_those_of_the_task(rates: Any):
     """Holds, noise and the nail count in control and physics steps of this length."""
-    rates = {"sim_freq": 120, "control_freq": 60, "scene_config": {"bounce_threshold": 1.0}}
     task = make_task("DoraCube-v1", 1, guidance="none", sim_config=rates)
     assert (task.config.physics_frequency, task.config.control_frequency) == (task.sim_freq, task.control_freq)
     assert task.control_freq == 60

@@ -6,6 +6,7 @@ from math import cos, pi, radians, sin
 import pytest
 import torch
 from invented import TIP_RADIUS, invented, memory
+from mani_skill.utils.structs import Pose
 from torch import Tensor
 
 import dora.tasks as tasks
@@ -151,6 +152,39 @@ def test_falling_over_and_being_dropped_are_failures(task: tasks.DoraEnv):
     rose = torch.linspace(0.0, 0.1, n)
     assert torch.equal(failed(standing, memory(n, highest=rose)), rose > CONFIG.dropped)
     assert failed(standing, task.memory).any()
+
+
+def test_a_jug_that_was_dropped_and_is_lifted_again_is_no_success():
+    task = tasks.make_task("DoraJug-v1", 1, preset="none")
+    task.reset(seed=0)
+    for _ in range(105):
+        info = task.step(task.scripted_action())[-1]
+    assert info["success"].all()
+    state = task.get_state_dict()
+
+    def put(height: float) -> dict:
+        """The jug stands beside the hand, or is held there in the air; two steps later."""
+        place = task.target_object.pose.p.clone()
+        place[:, :2] += 0.2
+        place[:, 2] = jug.jug().support + height
+        task.target_object.set_pose(Pose.create_from_pq(place, torch.tensor([[1.0, 0.0, 0.0, 0.0]])))
+        task.target_object.set_linear_velocity(torch.zeros(1, 3))
+        task.target_object.set_angular_velocity(torch.zeros(1, 3))
+        return [task.step(None)[-1] for _ in range(2)][-1]
+
+    assert put(0.0)["fail"].all()
+    info = put(0.08)
+    assert info["fail"].all()
+    assert not info["success"].any()
+    dropped = task.get_state_dict()
+    task.set_state_dict(state)
+    assert task.evaluate()["success"].all()
+    task.set_state_dict(dropped)
+    assert task.evaluate()["fail"].all()
+    earlier = {**dropped, "memory": {k: v for k, v in dropped["memory"].items() if k != "episode.failed"}}
+    task.set_state_dict(earlier)  # of a version that did not remember it
+    assert not task.evaluate()["fail"].any()
+    task.close()
 
 
 def test_masses_range_from_empty_to_full():

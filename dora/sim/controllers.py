@@ -172,6 +172,7 @@ class WristHandController(BaseController):
                 measured = torch.where(starting[:, None], measured, self.target)
             self.target = measured
         self._begun, self._starting = False, None
+        self._send()
 
     def expand_hand(self, hand: Float[Tensor, "n h"]) -> Float[Tensor, "n hand"]:
         """Values of the action's hand components -> values of all hand joints."""
@@ -267,7 +268,11 @@ class WristHandController(BaseController):
         if len(self.target) == 0:
             self.target = self.qpos.clone()
         self.target = self.target.index_copy(0, rows, target)
-        written = self.target[self.scene._reset_mask]  # all, or in a partial reset those of its environments
+        self._send()
+
+    def _send(self) -> None:
+        """Sends the commanded joints to the drives: all, or in a partial reset those of its environments."""
+        written = self.target[self.scene._reset_mask]
         self.articulation.set_joint_drive_targets(written, self.joints, self.active_joint_indices)
         if self.scene.gpu_sim_enabled:
             system: Any = self.scene.px  # PhysX's GPU system or BatchSystem

@@ -250,7 +250,7 @@ class DoraEnv(BaseEnv):
             self.resetting = False
 
     def _initialize_episode(self, env_idx: Tensor, options: dict) -> None:
-        begin_episodes(self, env_idx)
+        begin_episodes(self, env_idx, options)
 
     # -------------------------------------------------------------------- step
 
@@ -281,8 +281,7 @@ class DoraEnv(BaseEnv):
             self.arms.hold()
         self.task_scene.push(self.perturbations.pushes(step, len(self.objects)))
         super()._step_action(command)
-        collected = float(self.control_freq if self.task.CONTACT_EVERY_STEP else self.sim_freq)
-        self.task_scene.reader.record(self.memory, collected)
+        self.task_scene.reader.record(self.memory, self.control_freq if self.task.CONTACT_EVERY_STEP else self.sim_freq)
         s, observed = self._read(step + 1)  # ManiSkill counts the step after this method
         for name, o in s.objects.items():
             self.memory.record_rise(name, o.p[:, 2] - o.start_p[:, 2])
@@ -290,6 +289,7 @@ class DoraEnv(BaseEnv):
         now = self.machine.index.clone(), self.machine.by_arm(), self.arms.advance(observed)
         self._snapshot = advanced(s, *now)
         self._observed = self._snapshot if observed is s else advanced(observed, *now)
+        self.memory.record_failure(self.mdp.failed(self._snapshot, self.memory))
         return action
 
     def scripted_action(self) -> Float[Tensor, "n a"]:

@@ -1,6 +1,6 @@
 """The beginning of episodes: all random numbers are drawn here, and everything gets its first state from them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,10 @@ from torch import Tensor
 from dora.arguments import checked_rows, checked_seeds
 from dora.geometry.rotations import rotation_angle
 from dora.sim.batch.resets import START, check_rebuilding, checked_options
-from dora.tasks.env.state import check_start
+from dora.tasks.env.state import IN_PLACE, check_start
 
+SOWN = "sown"
+"""Option of a partial reset: the seeds that its environments have got already."""
 SCALE_DRAW = 256
 """Which number of an environment's stream is its size [1]: episodes begin with the same numbers, and use fewer."""
 
@@ -40,7 +42,8 @@ def requested(env: Any, seed: Any, options: Any) -> tuple[int | list[int] | None
         check_start(env, options[START], options.get("env_idx", torch.arange(env.num_envs, device=env.device)))
     if len(rows) < env.num_envs:
         if seeds is not None and len(rows) > 0:
-            _sow(env, options["env_idx"].tolist(), [seeds] if isinstance(seeds, int) else seeds)
+            options[SOWN] = [seeds] if isinstance(seeds, int) else seeds
+            _sow(env, options["env_idx"].tolist(), options[SOWN])
         return None, options
     if seeds is not None and START not in options:
         options["reconfigure"] = True
@@ -68,13 +71,24 @@ def drawn_sizes(env: Any, objects: Sequence[str]) -> Float[Tensor, "n objects"]:
     return torch.tensor(1 + env.config.randomisation.size * share, dtype=torch.float32, device=env.device)
 
 
-def begin_episodes(env: Any, rows: Int[Tensor, " b"]) -> None:
-    """Starts new episodes in the environments `rows`: robots, objects, memory, stages, noise, candidates."""
+def begin_episodes(env: Any, rows: Int[Tensor, " b"], options: Mapping[str, Any]) -> None:
+    """Starts new episodes in the environments `rows`: robots, objects, memory, stages, noise, candidates.
+
+    Args:
+        env: the environment.
+        rows: environments.
+        options: of the reset. With `IN_PLACE` robots and objects stay where they are.
+    """
+    if SOWN in options and env._enhanced_determinism:  # ManiSkill has drawn seeds of episodes from those since
+        _sow(env, rows.tolist(), options[SOWN])
     place, mass, friction, error, key = _draws(env, rows)
-    for arm in env.arms.values():
-        arm.agent.robot.set_qpos(arm.home_joints().expand(len(rows), -1))
-        arm.rest(rows)
-    env.task.place(env.task_scene, rows, place if env.chosen_start is None else env.chosen_start(place))
+    if options.get(IN_PLACE):
+        env.task.begin_in_place(env.task_scene, rows)
+    else:
+        for arm in env.arms.values():
+            arm.agent.robot.set_qpos(arm.home_joints().expand(len(rows), -1))
+            arm.rest(rows)
+        env.task.place(env.task_scene, rows, place if env.chosen_start is None else env.chosen_start(place))
     env.memory.begin(rows, {name: body.pose.p[rows] for name, body in env.objects.items()})
     randomisation = env.config.randomisation
     low, high = randomisation.friction

@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Any
 
 import torch
 from mani_skill import logger
 from mani_skill.agents.registration import REGISTERED_AGENTS
+from mani_skill.utils.structs.types import SimConfig
 
 from dora.affordance.candidates import GraspCandidates
 from dora.configs import check_finite, check_not_negative, check_ranges, overridden, plain
@@ -107,8 +109,10 @@ def numbers_under_preset(
 def _with_rates(config: TaskConfig, sim_config: Any) -> TaskConfig:
     """The numbers with the rates of a `sim_config`; one that makes no sense is left to ManiSkill's own keywords, which
     refuse it."""
-    given = sim_config if isinstance(sim_config, Mapping) else {}
-    rates = {ours: given[theirs] for theirs, ours in SIM_RATES.items() if type(given.get(theirs)) is int}
+    given = vars(sim_config) if isinstance(sim_config, SimConfig) else sim_config
+    given = {name: given.get(name) for name in SIM_RATES} if isinstance(given, Mapping) else {}
+    whole = {name: int(v) for name, v in given.items() if isinstance(v, Integral) and not isinstance(v, bool)}
+    rates = {ours: whole[theirs] for theirs, ours in SIM_RATES.items() if theirs in whole}
     changed = replace(config, **rates)
     sound = changed.control_frequency > 0 and changed.physics_frequency % changed.control_frequency == 0
     return changed if sound and changed.physics_frequency > 0 else config

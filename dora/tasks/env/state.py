@@ -16,8 +16,12 @@ from dora.sim.batch.resets import KINDS, STATES, check_body, check_finite_state,
 RANGES = {"mass": (1e-9, 1e9), "friction": (0.0, 1e9), "scale": (1e-3, 1e3), "elapsed": (0.0, 1e9)}
 """Ranges of numbers of "task" and "memory" in a state, by the last word of their name: masses [kg], friction [1],
 relative sizes [1] and control steps [1]."""
+IN_PLACE = "in_place"
+"""Option of the beginning of an episode whose robots and objects are where they shall be."""
 NOT_MEASURED = ("episode.penetration", "episode.max_penetration")
 """Numbers of the memory that are NaN where overlap is not measured."""
+LATER = ("episode.failed",)
+"""Numbers that states of earlier versions lack: 0."""
 
 
 def remembered(env: Any) -> dict[str, Any]:
@@ -100,7 +104,9 @@ def _fitted(state: dict[str, Any], like: Mapping[str, Any], count: int, what: st
     for name, part in like.items():
         path = f"{what}[{name!r}]"
         if name not in state:
-            if what != "state":  # whole parts may be missing, as in states of the simulator alone
+            if name in LATER:
+                out[name] = torch.zeros(count, *part.shape[1:], dtype=part.dtype, device=part.device)
+            elif what != "state":  # whole parts may be missing, as in states of the simulator alone
                 raise InputError(f"{path} is missing: the state has to be one of this task with these options.")
         elif isinstance(part, Mapping):
             if not isinstance(state[name], dict):
@@ -184,7 +190,7 @@ def _filled(like: Mapping[str, Any], columns: Iterator[Tensor]) -> dict[str, Any
 
 def restore(env: Any, state: dict, rows: Tensor) -> None:
     """Inverse of `saved_state` for the environments `rows` (b,), whose simulator has been restored: controllers and,
-    if it holds them, the task's parts."""
+    if it holds them, the task's parts. In a reset to a state of the simulator alone a new episode begins there."""
     if "controller" in state:
         for k, arm in enumerate(env.arms.values()):
             if arm.agent.commands_wrist:
@@ -197,11 +203,13 @@ def restore(env: Any, state: dict, rows: Tensor) -> None:
         for name, part in remembered(env).items():
             part.set_state(state[name], rows)
         env.task_scene.apply_properties(env.memory, rows)
+    elif env.resetting:
+        env._initialize_episode(rows, {IN_PLACE: True})
 
 
 def resize(env: Any, state: dict, rows: Tensor) -> None:
     """Builds the scene anew if the objects of a state have other sizes than those in the environments `rows`; keeps
-    everybody's state and, within a reset, everybody's random numbers."""
+    everybody's state and random numbers."""
     if "task" not in state:
         return
     scale = state["task"]["scale"].reshape(len(rows), -1)
@@ -214,9 +222,9 @@ def resize(env: Any, state: dict, rows: Tensor) -> None:
     env.rebuild(sizes)
     keep["task"]["scale"] = sizes
     env.set_state_dict(keep)
+    env._batched_main_rng, env._batched_episode_rng, env._episode_seed = streams
+    env._main_rng, env._episode_rng = env._batched_main_rng[0], env._batched_episode_rng[0]
     if env.resetting:
-        env._batched_main_rng, env._batched_episode_rng, env._episode_seed = streams
-        env._episode_rng = env._batched_episode_rng[0]
         env._last_obs = env.get_obs(env.get_info())
 
 

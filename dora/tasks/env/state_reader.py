@@ -81,7 +81,7 @@ class StateReader:
         """From now on `contacts` says where groups touch, for those who draw it."""
         self._contacts.keep_points()
 
-    def record(self, memory: EpisodeMemory, frequency: float) -> None:
+    def record(self, memory: EpisodeMemory, frequency: float | int) -> None:
         """Writes contacts and overlap of the last control step into the memory.
 
         Args:

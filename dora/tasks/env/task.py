@@ -90,6 +90,10 @@ class Task(ABC):
     def place(self, scene: "TaskScene", rows: Int[Tensor, " b"], u: Float[Tensor, "b d"]) -> None:
         """Puts the objects of the environments `rows` where `u` (b, DRAWS) in [0, 1) says."""
 
+    def begin_in_place(self, scene: "TaskScene", rows: Int[Tensor, " b"]) -> None:  # noqa: B027 (most tasks need not)
+        """Takes note that episodes begin with the objects of the environments `rows` where they are, since somebody has
+        set the state of the simulator."""
+
     def candidates(self, arm: str, region: bool = True) -> GraspCandidates:
         """Grasps with which an arm may handle its object; all that come with the object by default.
 

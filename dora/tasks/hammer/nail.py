@@ -163,13 +163,16 @@ class Nail:
         self._hammers, self._faces, self._radii = list(hammer._bodies), faces, radii
         watch_contacts(self._scene, self._watch)
 
-    def begin(self, rows: Int[Tensor, " b"]) -> None:
-        """Pulls the nails of the environments `rows` out."""
-        self.articulation.set_qpos(torch.zeros(len(rows), 1, device=self._device))
-        self.articulation.set_qvel(torch.zeros(len(rows), 1, device=self._device))
+    def begin(self, rows: Int[Tensor, " b"], pulled: bool = True) -> None:
+        """Forgets all blows in the environments `rows`, and pulls their nails out or, without `pulled`, leaves them."""
         index = rows.cpu().numpy()
+        if pulled:
+            self.articulation.set_qpos(torch.zeros(len(rows), 1, device=self._device))
+            self.articulation.set_qvel(torch.zeros(len(rows), 1, device=self._device))
         for name in STATE:
             getattr(self, name)[index] = 0.0
+        for i in [] if pulled else index.tolist():
+            self._depth[i] = max(float(self._bodies[i].qpos[0]), 0.0)
         self._since[index] = self.settings.blow_window
         self._hold(index.tolist())
         self._look(index.tolist())

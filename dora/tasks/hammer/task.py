@@ -283,9 +283,18 @@ class HammerTask(Task):
         scene.object.set_linear_velocity(torch.zeros_like(middle))
         scene.object.set_angular_velocity(c.spin * u[:, 6:9])
         self.nail.begin(rows)
+        self._forget(rows)
+        self.turning.write(rows, way=-angle.sign() if c.in_hand_turn else 0.0)
+
+    def begin_in_place(self, scene: TaskScene, rows: Tensor) -> None:
+        """The nail is as deep as it is, and no blow has driven it."""
+        self.nail.begin(rows, pulled=False)
+        self._forget(rows)
+
+    def _forget(self, rows: Tensor) -> None:
+        """Nothing is known yet of where the hammers were, and how they lie in the hand."""
         self.history.write(rows, history=UNKNOWN)
-        identity = torch.tensor([1.0, 0.0, 0.0, 0.0], device=scene.device)
-        self.turning.write(rows, held=identity, way=-angle.sign() if c.in_hand_turn else 0.0)
+        self.turning.write(rows, held=torch.tensor([1.0, 0.0, 0.0, 0.0], device=rows.device))
 
     def starts(self) -> ChosenStarts:
         """Place, height, tilt, roll and spin of the hammer when it is released: the random numbers themselves."""

@@ -65,11 +65,12 @@ class Mdp(Generic[S]):
             memory: what is remembered of the episodes.
 
         Returns:
-            `fail`: nothing can mend the episode, such as that of a jug that is dropped again. `raw_success`: finished
-            and not failed. `success`: besides, no overlap of the episode was above the limit. `success_at_end`:
-            besides, this very state passes the test of the last stage (of every arm), without its hold.
+            `fail`: nothing can mend the episode, such as that of a jug that was dropped, now or earlier. `raw_success`:
+            finished and not failed. `success`: besides, no overlap of the episode was above the limit.
+            `success_at_end`: besides, this very state passes the test of the last stage (of every arm), without
+            its hold.
         """
-        failed = self.failed(s, memory) | unreachable
+        failed = self.failed(s, memory) | memory.episode.failed.bool() | unreachable
         raw = finished & ~failed
         success = raw & (memory.max_penetration <= self.penetration_limit)
         if isinstance(self.stages, Mapping):

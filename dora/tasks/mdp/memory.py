@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dora.tasks.mdp.buffers import Buffers
@@ -35,7 +35,8 @@ class EpisodeMemory:
         hands: per arm `touch` (0 or 1) and `force` [N] of each part, `contact_p` [m] and `contact_finger` of up to so
             many contact points, in the object frame; of the last control step.
         objects: per object `start_p` [m], `highest` rise so far [m], `supported` (0 or 1), `mass` [kg], `friction`.
-        episode: `penetration` of the last control step and `max_penetration` of all [m]; the last two actions.
+        episode: `penetration` of the last control step and `max_penetration` of all [m]; the last two actions; whether
+            it has `failed` (0 or 1).
     """
 
     def __init__(
@@ -62,7 +63,9 @@ class EpisodeMemory:
             for name in objects
         }
         size = (action_size,)
-        self.episode = Buffers(num_envs, device, penetration=(), max_penetration=(), action=size, previous_action=size)
+        self.episode = Buffers(
+            num_envs, device, penetration=(), max_penetration=(), action=size, previous_action=size, failed=()
+        )
 
     @property
     def object(self) -> Buffers:
@@ -91,6 +94,10 @@ class EpisodeMemory:
         """Takes note of an object's present height above its start [m]."""
         o = self.objects[name]
         o.update(highest=torch.maximum(o.highest, rise))
+
+    def record_failure(self, failed: Bool[Tensor, " n"]) -> None:
+        """Takes note of which episodes have failed in the last control step: they stay so."""
+        self.episode.update(failed=torch.maximum(self.episode.failed, failed.float()))
 
     def record_action(self, action: Float[Tensor, "n a"]) -> None:
         """Shifts the action history by one."""
