@@ -232,6 +232,28 @@ def test_a_success_ends_an_episode_unless_that_is_ignored(sb3: Any, ignored: boo
     assert (info["is_success"], info["TimeLimit.truncated"]) == (True, ignored)
 
 
+def test_options_of_a_vecenv_are_those_of_its_next_reset(sb3: Any):
+    from dora.integrations.sb3 import BatchVecEnv
+
+    class Asked(Succeeding):
+        options: Any = None
+
+        def reset(self, *, seed: Any = None, options: Any = None) -> tuple[torch.Tensor, dict]:
+            self.options = options
+            return super().reset(seed=seed)
+
+    batch = Asked()
+    env = BatchVecEnv(batch)
+    env.set_options({"reconfigure": True})
+    env.reset()
+    assert batch.options == {"reconfigure": True}
+    env.reset()
+    assert batch.options is None
+    env.set_options([{"reconfigure": True}, {}])
+    with pytest.raises(ValueError, match="give all of them the same"):
+        env.reset()
+
+
 def test_stable_baselines_learns_and_evaluates_on_it(sb3: Any):
     from stable_baselines3.common.evaluation import evaluate_policy
 

@@ -180,14 +180,15 @@ def test_a_row_names_the_thousands_of_its_steps_and_the_deviation_of_its_minutes
     assert table_rows(runs[:1])[0][10] == "1.0"
 
 
-def test_learners_tell_runs_apart_only_where_all_say_how_they_learned():
+def test_learners_tell_runs_apart_and_one_that_does_not_say_how_it_learned_is_as_most_are():
     """Results of earlier versions do not."""
     settings = [made(learner_config={"gamma": gamma}, seed=k) for k, gamma in enumerate((0.9, 0.9, 0.5))]
     assert [key[3] for key in grouped(settings)] == ["affordance", "affordance, learner.gamma 0.5"]
-    assert [key[3] for key in grouped([*settings, made()])] == ["affordance"]
-    assert [key[3] for key in grouped([made(learner_config=None), made(learner_config={"gamma": 0.9})])] == [
-        "affordance, learner.gamma 0.9", "affordance, learner.gamma None",
-    ]  # fmt: skip
+    for unknown in (made(), made(learner_config=None)):
+        rows = grouped([*settings, unknown])
+        assert {key[3]: len(runs) for key, runs in rows.items()} == {
+            "affordance": 3, "affordance, learner.gamma 0.5": 1,
+        }  # fmt: skip
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -156,6 +156,11 @@ NEUTRAL_LEARNER = {
     "sac": CONSTANT_PULL,
 }
 """The same of settings of each learner."""
+TRAINING = frozenset((
+    "stop_success", "eval_every", "eval_episodes", "normaliser_samples", "stagger", "after_success", "overlap_share",
+    "overlap_steps",
+))  # fmt: skip
+"""Settings of a run that change its training or what is chosen of it, beside learner, task and environments."""
 DIGITS = 12
 """Hexadecimal digits of a digest of settings."""
 LEARNER_CONFIGS: dict[str, type[PPOConfig] | type[SACConfig]] = {
@@ -268,6 +273,13 @@ def stored_digests(content: Mapping[str, Any]) -> tuple[str, ...]:
     first = {name: value for name, value in settings.items() if name != "task" or value}
     text = json.dumps(first, sort_keys=True).encode()
     return digest_of(settings)[:DIGITS], digest_of(whole)[:DIGITS], hashlib.sha256(text).hexdigest()[:DIGITS]
+
+
+def of_training(config: RunConfig) -> dict[str, Any]:
+    """Settings of a training beside those of its learner and task, which tell runs apart that are no seeds of each
+    other; those of the machine and of the last evaluation are left out."""
+    names = TRAINING if config.overlap_share < 1 else TRAINING - {"overlap_steps"}
+    return {name: getattr(config, name) for name in sorted(names)}
 
 
 def config_from_dict(content: Any, source: str = "the settings") -> RunConfig:

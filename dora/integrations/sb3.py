@@ -52,10 +52,19 @@ class BatchVecEnv(VecEnv):
         self.metadata = env.metadata
 
     def reset(self) -> np.ndarray:
-        """Begin new episodes everywhere, with the seed of `seed`, if it was called since the last reset; (n, o)."""
-        first = self._seeds[0]
-        obs, _ = self.env.reset(seed=None if first is None else self._seeds)  # pyright: ignore[reportArgumentType]
+        """Begin new episodes everywhere, with the seed of `seed` and the options of `set_options`, if they were called
+        since the last reset; (n, o).
+
+        Raises:
+            ValueError: environments were given different options.
+        """
+        first, options = self._seeds[0], self._options[0]
+        if any(own != options for own in self._options):
+            raise ValueError("The environments of a batch share the options of a reset: give all of them the same.")
+        seeds: Any = None if first is None else self._seeds
+        obs, _ = self.env.reset(seed=seeds, options=options or None)
         self._reset_seeds()
+        self._reset_options()
         return as_array(obs)
 
     def step_async(self, actions: np.ndarray) -> None:

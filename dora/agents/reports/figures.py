@@ -136,6 +136,20 @@ def shortened(name: str) -> str:
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
+def _together(
+    curves: Sequence[Sequence[tuple[float, float]]],
+) -> tuple[Float[np.ndarray, " x"], Float[np.ndarray, "runs x"]]:
+    """Curves of several runs at the same x: those at which every run was evaluated between its first and last one, with
+    straight lines between evaluations.
+
+    A run that was good enough early keeps its last value. Nothing is drawn before all runs have begun.
+    """
+    known = [np.array(curve) for curve in curves]
+    at = np.unique(np.concatenate([curve[:, 0] for curve in known]))
+    at = at[at >= max(curve[0, 0] for curve in known)]
+    return at, np.stack([np.interp(at, *curve.T) for curve in known])
+
+
 def _draw_evaluations(axes: Any, groups: dict[Group, list[Run]]) -> dict[Group, Any]:
     """Three axes of greedy evaluations; returns the colour of each group."""
     colours: dict[Group, Any] = {}
@@ -143,14 +157,12 @@ def _draw_evaluations(axes: Any, groups: dict[Group, list[Run]]) -> dict[Group, 
     views = ((*by_steps, "success_rate"), (*by_minutes, "success_rate"), (*by_steps, "return_mean"))
     for axis, (x, unit, y) in zip(axes, views, strict=True):
         for group, members in groups.items():
-            length = max(len(m.curve) for m in members)  # a run that was good enough early keeps its last value
-            values = [[m.curve[min(i, len(m.curve) - 1)][y] for m in members] for i in range(length)]
-            at = [mean(m.curve[i][x] for m in members if i < len(m.curve)) / unit for i in range(length)]
+            at, values = _together([[(row[x] / unit, row[y]) for row in m.curve] for m in members])
             label = f"{shortened(group[2])}, guidance {shortened(group[3])}, {group[4]}k ({len(members)})"
             colour = colours.get(group, COLOURS.get(group[2:4]))
-            (line,) = axis.plot(at, [mean(v) for v in values], color=colour, marker="o", markersize=3, label=label)
+            (line,) = axis.plot(at, values.mean(0), color=colour, marker="o", markersize=3, label=label)
             colour = colours[group] = line.get_color()
-            axis.fill_between(at, [min(v) for v in values], [max(v) for v in values], color=colour, alpha=0.15)
+            axis.fill_between(at, values.min(0), values.max(0), color=colour, alpha=0.15)
             zero = [rate for rate, _ in zero_shares(members)]
             if zero and y == "success_rate":
                 axis.axhline(mean(zero), color=colour, linestyle=":")

@@ -69,7 +69,8 @@ NOTE = (
     "differ nor that they have the same starts. Episodes of zero correction on the same starts are the same and count "
     f"once. Other columns: mean and deviation over seeds. Minutes with{SHARED}: other programs kept more than {ALONE} "
     f"cores busy meanwhile; with{UNKNOWN}: that was not measured. Guidance '{EARLIER.strip(', ')}': what counts as "
-    "a success has changed since (definition in the task's numbers), and the figures are by the earlier rules."
+    "a success has changed since (definition in the task's numbers), and the figures are by the earlier rules. A run "
+    "that was repeated with the same seed and settings counts once."
 )
 """What stands below the table."""
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from dora.agents.config import NEUTRAL, NEUTRAL_LEARNER, in_effect
+from dora.agents.config import NEUTRAL, NEUTRAL_LEARNER, TRAINING, in_effect
 from dora.agents.evaluation.evaluate import FINAL_SEED
 from dora.agents.runs.progress_table import read_progress
 from dora.agents.runs.stored_results import check_agreement, read_curve, read_episodes, read_result
@@ -60,6 +60,8 @@ class Run:
     zero: dict[str, Float[np.ndarray, " z"]] = field(default_factory=dict)
     outdated: bool = False
     """The task's rules have changed since (`TaskConfig.definition`)."""
+    label: str = field(default="", compare=False)
+    """In what it differs from the other runs of its task, learner and guidance, in words; set by `grouped`."""
 
     @property
     def group(self) -> Group:
@@ -85,6 +87,19 @@ class Run:
     def budget(self) -> int:
         """Environment steps for which the run was meant."""
         return self.result.get("total_steps", self.result["env_steps"])
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings that tell it from a run which is no other seed of it, by name: of task, learner, training."""
+        r = self.result
+        learner = r.get("learner_config")  # results of earlier versions lack it, and the settings of training
+        learned = {} if learner is None else NEUTRAL_LEARNER.get(r["agent"], {}) | learner
+        count = r.get("num_envs")
+        environments = {} if count is None else {"environments": count * max(r.get("workers") or 0, 1)}
+        named = {f"learner.{name}": value for name, value in learned.items()}
+        return (
+            dict(flat(in_effect(r.get("task_config") or {}))) | named | (r.get("training_config") or {}) | environments
+        )
 
 
 def find_runs(root: Path, rules: Mapping[str, int] | None = None) -> list[Run]:
@@ -116,12 +131,16 @@ def find_runs(root: Path, rules: Mapping[str, int] | None = None) -> list[Run]:
 
 
 def _once(runs: Sequence[Run]) -> list[Run]:
-    """The runs without copies of them in other folders."""
+    """The runs without copies and repetitions: one with the same settings and seed is no other seed. Of several that
+    with most episodes counts, the first of equals."""
     found: dict[tuple[Any, ...], Run] = {}
     for run in runs:
         r = run.result
-        key = run.group, r.get("seed"), r.get("config_digest"), r["env_steps"], r["wall_seconds"], r["success_rate"]
-        found.setdefault((*key, r.get("first_seed"), r.get("checkpoint")), run)
+        digest = r.get("config_digest")
+        known = digest if digest is not None else (r["env_steps"], r["wall_seconds"], r["success_rate"])
+        key = run.group, r.get("seed"), known, r.get("first_seed"), r.get("checkpoint")
+        if key not in found or r.get("eval_episodes", 0) > found[key].result.get("eval_episodes", 0):
+            found[key] = run
     return list(found.values())
 
 
@@ -163,17 +182,15 @@ def grouped(runs: Sequence[Run]) -> dict[Group, list[Run]]:
     rows: dict[Group, list[Run]] = {}
     for (env, preset, agent, guidance, thousands), members in groups.items():
         for difference, alike in _by_task(members).items():
-            rows[env, preset, agent, guidance + difference, thousands] = alike
+            row = env, preset, agent, guidance + difference, thousands
+            rows[row] = [replace(run, label=row[3].partition(", ")[2]) for run in alike]
     return dict(sorted(rows.items()))
 
 
 def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Runs by what the numbers of their task differ in, in words: by switches alone where these tell them apart. What
     more runs have than have anything else goes without saying."""
-    known = all("learner_config" in run.result for run in runs)  # results of earlier versions lack it
-    numbers = [
-        dict(flat(in_effect(run.result.get("task_config") or {}))) | (_learner(run) if known else {}) for run in runs
-    ]
+    numbers = _filled([run.settings for run in runs])
     names = sorted({name for each in numbers for name in each})
     different = [name for name in names if len({str(each.get(name)) for each in numbers}) > 1]
     switches = [name for name in different if isinstance(numbers[0].get(name), bool | str)]
@@ -194,6 +211,17 @@ def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return found
 
 
+def _filled(settings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The settings of runs; of those of learner and training what a result of an earlier version does not say is what
+    most others have."""
+    found: dict[str, list[Any]] = defaultdict(list)
+    for name, value in (item for each in settings for item in each.items()):
+        if name in TRAINING or name.startswith("learner."):
+            found[name].append(value)
+    usual = {name: max(values, key=values.count) for name, values in found.items()}
+    return [usual | each for each in settings]
+
+
 def _most_frequent(values: Sequence[tuple[str, ...]]) -> tuple[str, ...] | None:
     """What stands more often among `values` than anything else; None if nothing does."""
     first, *others = Counter(values).most_common(2)
@@ -210,12 +238,6 @@ def _phrases(said: Mapping[str, str]) -> list[str]:
 def in_words(name: str, value: str) -> str:
     """A number or switch of a task with its value."""
     return IN_WORDS.get((name, value), f"{name} {value}")
-
-
-def _learner(run: Run) -> dict[str, Any]:
-    """Settings of the learner by name."""
-    settings = NEUTRAL_LEARNER.get(run.result["agent"], {}) | (run.result["learner_config"] or {})
-    return {f"learner.{name}": value for name, value in settings.items()}
 
 
 def success_shares(runs: Sequence[Run]) -> list[tuple[float, int]]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from dora.agents.config import RunConfig, config_from_dict
+from dora.agents.config import RunConfig, config_from_dict, of_training
 from dora.agents.evaluation.evaluate import Evaluation
 from dora.agents.limits import check
 from dora.agents.runs.stored_results import MOST_RESULT, OF_TABLES, with_digests
@@ -306,6 +306,7 @@ def make_result(
         "first_seed": some.first_seed if some else None,
         "other_load": other_seconds / wall_seconds if other_seconds is not None and wall_seconds > 0 else None,
         "learner_config": plain(config.learner),
+        "training_config": of_training(config),
     }
 
 

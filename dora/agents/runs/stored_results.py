@@ -44,6 +44,7 @@ OPTIONAL = {
     "eval_episodes": "count", "total_steps": "count", "first_seed": "count or none", "task": "mapping",
     "other_load": "amount or none", "raw_success_rate": "share or none", "steps_to_80": "count or none",
     "stage_rates": "shares", "seed": "count", "task_config": "mapping or none", "learner_config": "mapping or none",
+    "training_config": "mapping or none",
     "overlap_share": "share", "config_digest": "text", OF_TABLES: "mapping", SEAL: "text",
 }  # fmt: skip
 """The same of entries that results of some versions have."""
