@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.candidates import MAP_POINTS, GraspCandidates, concatenate
@@ -13,7 +14,7 @@ from dora.affordance.contact_maps import class_agreement, map_bundled_set, mappe
 from dora.affordance.hand.hand_model import HandModel
 from dora.affordance.maps.affordance_map import AffordanceMap
 from dora.affordance.maps.packed_maps import COUNT, MOST_POINTS, PART, POINT, pack, unpack
-from dora.affordance.maps.voting import HAND_PARTS
+from dora.affordance.maps.voting import HAND_PARTS, vote_over_map
 from dora.affordance.objects.catalogue import available_objects, load_object
 from dora.errors import InputError
 from dora.files import read_tensors, write_tensors
@@ -166,6 +167,20 @@ def test_bundled_maps_are_those_of_the_poses(name: str):
     assert obj.folder is not None
     assert (obj.folder / "grasps.safetensors").stat().st_size < LARGEST_FILE
     assert class_agreement(found, obj, map).grasps.sum() >= found.of_class(*obj.classes).sum()
+
+
+def test_maps_over_the_points_of_another_file_of_the_same_surface_are_made_anew(jug: GraspCandidates):
+    """As many points, elsewhere: their order is that of the mesh's faces."""
+    obj, hand, some = load_object("jug"), HandModel(ROBOT), jug.select(slice(12))
+    order = np.random.default_rng(0).permutation(len(obj.mesh.faces))
+    mesh = trimesh.Trimesh(obj.mesh.vertices, obj.mesh.faces[order], process=False)
+    other = AffordanceMap.from_object(replace(obj, mesh=mesh, face_labels=obj.face_labels[order]))
+    found = mapped(some, other, hand)
+    assert torch.equal(found.contact_map, with_contact_maps(some, other, hand).contact_map)
+    own, votes = AffordanceMap.from_object(obj), vote_over_map(other, found.contact_map)
+    assert torch.equal(votes, vote_over_map(own, some.contact_map))
+    assert (vote_over_map(other, some.contact_map) != votes).any()
+    assert mapped(found, other, hand) is found
 
 
 def test_a_bundled_set_gets_maps_and_stays_as_it_is(

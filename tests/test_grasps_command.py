@@ -260,6 +260,16 @@ def test_validity_is_that_of_the_simulation(monkeypatch: pytest.MonkeyPatch):
     assert report["valid_per_second"] == pytest.approx(2 / seconds)
 
 
+def test_the_digest_of_a_report_depends_on_the_mass():
+    """Closing, ranking and the grasp test do."""
+    robot, digests = load_robot("diana7_hit"), set()
+    for mass in (0.1, 0.1, 2.0):
+        obj = replace(load_object("cube"), mass=mass)
+        generated = grasps.generate(obj, robot, 2, 0, None, ProgressDisplay(), simulate=False, settings=QUICK)
+        digests.add(grasps.summary(generated)["digest"])
+    assert len(digests) == 2
+
+
 def at_handle_and_body(
     candidates: GraspCandidates, robot: object, test_settings: object, progress: object
 ) -> Validation:

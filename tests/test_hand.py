@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import pytorch_kinematics
 import torch
+from other_robots import changed, unchanged
 from refusals import refused
 
 from dora.affordance.hand.capsules import Capsule, capsules_of, farthest_points
 from dora.affordance.hand.hand_model import PALM, HandModel
+from dora.errors import InputError
 from dora.geometry.rotations import matrix_from_rotation_vector
 from dora.robot import RobotDescription, Shape
 
@@ -133,6 +135,8 @@ def test_only_pairs_that_may_collide_are_watched(robot, hand):
     [
         (Shape("box", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.03, 0.01, 0.02)), 8),
         (Shape("cylinder", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.01, 0.03)), 1),
+        (Shape("cylinder", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.045, 0.005)), 9),
+        (Shape("cylinder", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.01, 0.01)), 1),
         (Shape("sphere", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.01,)), 1),
         (Shape("capsule", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.01, 0.03)), 1),
     ],
@@ -145,6 +149,30 @@ def test_capsules_of_every_kind_of_shape_stay_inside_it(shape, inside):
     if shape.kind == "capsule":
         half[0] += shape.size[0]
     np.testing.assert_allclose(reach, half)
+
+
+def test_a_disc_becomes_capsules_that_lie_in_it_and_cover_it():
+    disc = Shape("cylinder", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.04, 0.005))
+    capsules = capsules_of(disc, 0, "link", np.eye(4))
+    ends = np.concatenate([(c.start, c.end) for c in capsules])
+    assert np.hypot(ends[:, 1], ends[:, 2]).max() + 0.005 <= 0.04 + 1e-12
+    assert np.abs(ends[:, 0]).max() < 1e-12
+    middle = np.random.default_rng(0).uniform(-0.024, 0.024, (200, 3)) * [0, 1, 1]
+    assert np.min([c.distance(middle) for c in capsules], axis=0).max() < 0
+    foil = Shape("cylinder", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.04, 0.00005))
+    with pytest.raises(InputError, match=r"cylinder of the link 'link' is 0\.0001 m thin"):
+        capsules_of(foil, 0, "link", np.eye(4))
+
+
+def test_the_last_link_of_a_shorter_finger_leans_to_its_tip(tmp_path, hand):
+    """Its contact points reach round the end; those of a link that another one follows face the palm alone."""
+    short = HandModel(changed(tmp_path / "short", unchanged, short=True))
+    least = []
+    for model in (short, hand):
+        rows = model.contacts.body == model.links.index("Right_Little_Phamed")
+        least.append(float(model.contact_normal[rows][:, 1].min()))  # the palmar side of the link is y
+    assert least[0] < 0.4
+    assert least[1] > 0.59
 
 
 def test_farthest_points_spread():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from other_robots import changed, mounted
 from placements import yaws
 
 from dora.errors import InputError
@@ -77,6 +78,13 @@ def test_tracking_keeps_to_a_line(kinematics):
     places, _ = kinematics.chain.tip_pose(path[0])
     assert (places - line[0]).norm(dim=1).max() < POSITION_TOLERANCE
     assert (path[0, 1:] - path[0, :-1]).abs().max() < 0.3
+
+
+def test_a_fixed_joint_before_the_first_one_changes_nothing(tmp_path, kinematics):
+    other = InverseKinematics(changed(tmp_path / "mounted", mounted))
+    torch.testing.assert_close(other._axis, kinematics._axis)
+    poses = reachable_poses(kinematics, 100)
+    torch.testing.assert_close(other.solve(*poses).q, kinematics.solve(*poses).q)
 
 
 def test_a_start_posture_of_another_arm_is_refused(robot):

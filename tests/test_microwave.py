@@ -1,5 +1,6 @@
 """DoraMicrowave-v1: geometry and references on invented states, and what the scripted solution does."""
 
+from dataclasses import replace
 from math import pi, radians
 from typing import Any
 
@@ -23,9 +24,11 @@ from dora.geometry.rotations import (
     rotation_angle,
 )
 from dora.robot import load_robot
+from dora.tasks.env.arm import Arm
 from dora.tasks.env.options import task_config
 from dora.tasks.env.starts import STANDING_DRAWS
 from dora.tasks.microwave import mdp
+from dora.tasks.microwave import task as microwave
 from dora.tasks.microwave.mdp import MicrowaveConfig
 from dora.tasks.microwave.reach import STEP, placing_way
 from dora.tasks.microwave.reference import OpenSettings, PlaceSettings, entry_turn, opening, placing, with_door
@@ -214,6 +217,26 @@ def test_shares_that_are_drawn_say_where_a_microwave_stands_and_how_it_resists(t
     for name, number, way in zip(names[3:], nominal, ways, strict=True):
         assert begun[name].tolist() == pytest.approx([number * (1 + 0.5 * way)])
     task.reset(seed=1)
+
+
+def test_no_set_of_candidates_takes_the_reach_of_one_that_is_gone(monkeypatch: pytest.MonkeyPatch):
+    """Ids of what has been freed are given again."""
+
+    class Reach:
+        def __init__(self, arm: Any, candidates: Any, *_: Any):
+            self.found = candidates.position[None, :, 0] > 0.5
+
+        def mask(self, p: Tensor, q: Tensor) -> Tensor:
+            return self.found
+
+    monkeypatch.setattr(microwave, "oven_reach", Reach)
+    task: Any = MicrowaveTask(MicrowaveConfig())
+    task._reach = {}
+    arm, some = Arm.__new__(Arm), load_candidates("microwave").select(slice(2))
+    arm.name = LEFT
+    for k in range(100):
+        own = replace(some, position=some.position * 0 + (k % 3 == 1))
+        assert task._followed(arm, torch.zeros(1, 3), torch.zeros(1, 4), own).tolist() == [[k % 3 == 1] * 2]
 
 
 def test_arms_have_candidates_of_their_own():

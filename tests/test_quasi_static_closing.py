@@ -1,9 +1,13 @@
 """The quasi-static model of a squeezing hand: what it says of grasps whose outcome is known."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from other_robots import SHORT, changed, unchanged
 
 from dora.affordance.bundled_sets import load_candidates
 from dora.affordance.hand.grasp_test_settings import STANDARD, GraspTestSettings
@@ -12,6 +16,7 @@ from dora.affordance.hand.postures import pregrasp, squeeze
 from dora.affordance.maps.contact_semantic_map import wrist_matrix
 from dora.affordance.objects.catalogue import load_object
 from dora.affordance.objects.signed_distance import SignedDistanceField
+from dora.affordance.search import quasi_static_closing
 from dora.affordance.search.compiled import CompiledEnergy
 from dora.affordance.search.quasi_static_closing import ClosedHand, close_hand
 from dora.geometry.rotations import matrix_from_quaternion
@@ -48,6 +53,33 @@ def test_grasps_that_hold_in_simulation_hold_in_the_model(energy: CompiledEnergy
     assert (found.displacement.amax(-1) < HELD).sum() >= 3
     assert (found.force > 5).all()
     assert (found.shift < HELD).all()
+
+
+def test_a_finger_with_fewer_joints_leaves_the_first_joint_of_the_hand_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Chains are padded to the longest one, and what stands for no joint has the index of the first."""
+    short = changed(tmp_path / "short", unchanged, short=True)
+    ends: list[np.ndarray] = []
+
+    def kept(*arguments: Any) -> Any:
+        result = close_and_load(*arguments)
+        ends.append(arguments[6].copy())  # the joints, which it changes in place
+        return result
+
+    close_and_load = quasi_static_closing.close_and_load
+    monkeypatch.setattr(quasi_static_closing, "close_and_load", kept)
+    energy = CompiledEnergy(HandModel(short), SignedDistanceField(CUBE.solid))
+    grasps = load_candidates("cube").select(slice(12))
+    joints = grasps.joints[:, [name != SHORT for name in ROBOT.hand.names]]
+    wrist = wrist_matrix(grasps.position, grasps.quaternion)
+    opened = pregrasp(short, joints)
+    found = close_hand(energy, wrist, opened, squeeze(short, joints), CUBE.mass)
+    first = (energy.hand.joint_index == 0).nonzero()[:, 0].tolist()
+    assert len(first) == 2  # the joint itself, and what pads the little finger
+    moved = np.abs(ends[0][:, first[0]] - ends[0][:, first[1]])
+    assert moved.max() > 1e-3  # contacts have moved it
+    np.testing.assert_allclose(found.joints[:, 0].numpy(), ends[0][:, first[0]], atol=1e-6)
 
 
 def test_a_hand_in_the_air_or_left_open_holds_nothing(energy: CompiledEnergy):

@@ -57,6 +57,11 @@ def test_filters(candidates: GraspCandidates):
     assert Filter(both, viewing.INVALID).rows(candidates).tolist() == [2, 5, 8, 11]
     assert Filter(both, term="closure", share=0.25).rows(candidates).tolist() == [0, 1, 2]
     assert Filter(frozenset()).rows(candidates).tolist() == []
+    lacking = candidates.energy["closure"].clone()
+    lacking[:6] = torch.nan
+    some = replace(candidates, energy={"closure": lacking})
+    assert len(Filter(both, term="closure").rows(some)) == COUNT
+    assert Filter(both, term="closure", share=0.5).rows(some).tolist() == [6, 7, 8]
     assert Filter(frozenset({"BodyGrasp"}), VALID, "closure", 0.5).rows(candidates).tolist() == [0, 4]
 
 

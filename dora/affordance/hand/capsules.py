@@ -29,7 +29,7 @@ BURIED = -2e-4
 THIN = 1e-3
 """Radius below which a capsule is enlarged to sample its surface [m]."""
 MOST_CAPSULES = 300
-"""Largest number of capsules of a hand, and of one box [1]."""
+"""Largest number of capsules of a hand, and of one box or flat cylinder [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +75,12 @@ class Capsule:
 def capsules_of(shape: Shape, body: int, link: str, pose: np.ndarray) -> list[Capsule]:
     """A collision shape of `link` as inscribed capsules; `pose` (4, 4) is that of the link in its body [m].
 
-    Exact for capsules and spheres. A cylinder becomes the longest capsule inside it; a box becomes a row of capsules
-    along its longest side, with its smallest half side as radius. Only the edges are lost.
+    Exact for capsules and spheres. A cylinder becomes the longest capsule inside it, a flat one a row of capsules
+    across it, with half its thickness as radius; a box becomes a row of capsules along its longest side, with its
+    smallest half side as radius. Only the edges are lost.
 
     Raises:
-        InputError: a thin box would become more than `MOST_CAPSULES`.
+        InputError: a thin box or cylinder would become more than `MOST_CAPSULES`.
     """
     turn = pose[:3, :3] @ matrix_from_quaternion(torch.tensor(shape.quaternion, dtype=torch.float64)).numpy()
     center = pose[:3, :3] @ np.asarray(shape.position) + pose[:3, 3]
@@ -87,8 +88,10 @@ def capsules_of(shape: Shape, body: int, link: str, pose: np.ndarray) -> list[Ca
         return _box(np.asarray(shape.size), center, turn, body, link)
     radius = shape.size[0]
     half = 0.0 if shape.kind == "sphere" else shape.size[1]
+    if shape.kind == "cylinder" and half < radius:
+        return _disc(radius, half, center, turn, body, link)
     if shape.kind == "cylinder":
-        half = max(half - radius, 0.0)
+        half -= radius
     reach = turn @ np.array([half, 0.0, 0.0])
     return [Capsule(body, link, center - reach, center + reach, radius)]
 
@@ -96,16 +99,31 @@ def capsules_of(shape: Shape, body: int, link: str, pose: np.ndarray) -> list[Ca
 def _box(half: np.ndarray, center: np.ndarray, turn: np.ndarray, body: int, link: str) -> list[Capsule]:
     thin, middle, long = np.argsort(half)
     radius = float(half[thin])
-    count = math.ceil((half[middle] - radius) / radius) + 1
+    reach = turn[:, long] * (half[long] - radius)
+    offsets = [
+        row * (half[middle] - radius) * turn[:, middle] for row in _rows(float(half[middle]), radius, "box", link)
+    ]
+    return [Capsule(body, link, center + offset - reach, center + offset + reach, radius) for offset in offsets]
+
+
+def _disc(radius: float, thin: float, center: np.ndarray, turn: np.ndarray, body: int, link: str) -> list[Capsule]:
+    """A flat cylinder about its x axis as capsules along y, side by side along z."""
+    inner, found = radius - thin, []
+    for row in _rows(radius, thin, "cylinder", link):
+        offset, reach = row * inner * turn[:, 2], inner * math.sqrt(1 - row * row) * turn[:, 1]
+        found.append(Capsule(body, link, center + offset - reach, center + offset + reach, thin))
+    return found
+
+
+def _rows(half: float, radius: float, kind: str, link: str) -> np.ndarray:
+    """Places -1 to 1 of capsules with this radius side by side, which together are 2 `half` wide [m]."""
+    count = math.ceil((half - radius) / radius) + 1
     if count > MOST_CAPSULES:
         raise InputError(
-            f"a collision box of the link {link!r} is {2 * radius:g} m thin, so that it needs {count} capsules, and "
+            f"a collision {kind} of the link {link!r} is {2 * radius:g} m thin, so that it needs {count} capsules, and "
             f"{MOST_CAPSULES} are allowed: make it thicker or narrower in the URDF."
         )
-    reach = turn[:, long] * (half[long] - radius)
-    rows = np.linspace(-1.0, 1.0, count) if count > 1 else np.zeros(1)
-    offsets = [row * (half[middle] - radius) * turn[:, middle] for row in rows]
-    return [Capsule(body, link, center + offset - reach, center + offset + reach, radius) for offset in offsets]
+    return np.linspace(-1.0, 1.0, count) if count > 1 else np.zeros(1)
 
 
 def palmar_points(

@@ -213,6 +213,7 @@ class HandModel:
         normal = self._unit(palmar[first:, 0].mean(0))
         finger = along[first:, 0].mean(0)
         finger = self._unit(finger - normal * (finger @ normal))
+        last = [sum(joint.moves for joint in chain) - 1 for chain in chains]
         bodies, points, normals = [], [], []
         for body in range(len(self.links)):
             shapes = [capsule for capsule in self.capsules if capsule.body == body]
@@ -220,7 +221,7 @@ class HandModel:
                 continue
             turn = poses[body, :3, :3].T
             place = divmod(body - 1, self.depth)
-            tip = turn @ along[place] if body and place[1] == self.depth - 1 else None
+            tip = turn @ along[place] if body and place[1] == last[place[0]] else None
             facing = turn @ palmar[place] if body else normal
             found = palmar_points(shapes, facing, POINTS_PER_LINK if body else POINTS_ON_PALM, tip)
             free = _outside_others(self.capsules, poses, body, found[0])

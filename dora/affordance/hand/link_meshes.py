@@ -8,15 +8,18 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+import torch
 import trimesh
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from trimesh.visual import ColorVisuals
 
 from dora.affordance.objects.solids import shape_mesh
 from dora.containers import MOST_FACES, check_container, check_triangles
 from dora.errors import InputError
+from dora.geometry.rotations import matrix_from_quaternion
 from dora.reading import read_xml
 from dora.robot import RobotDescription
+from dora.robot.urdf_values import numbers, origin
 
 GAMMA = 2.2
 """Exponent between the linear colours of a glTF material and the colours of a screen [1]."""
@@ -55,19 +58,35 @@ def face_colours(mesh: trimesh.Trimesh) -> UInt8[np.ndarray, "f 4"]:
     return np.asarray(cast(ColorVisuals, mesh.visual).face_colors)
 
 
-def _visual_files(robot: RobotDescription) -> dict[str, list[Path]]:
-    """Files of the visual meshes of each link of the URDF; meshes are in the link frames."""
-    files = {}
+Placed = tuple[Path, Float[np.ndarray, "4 4"]]
+"""A file of a mesh, and what takes its points into the frame of the link: scale, then pose [m]."""
+
+
+def _visual_files(robot: RobotDescription) -> dict[str | None, list[Placed]]:
+    """The visual meshes of each link of the URDF."""
+    files: dict[str | None, list[Placed]] = {}
     for link in read_xml(robot.urdf, "URDF").findall("link"):
-        meshes = link.findall("visual/geometry/mesh")
-        files[link.get("name")] = [robot.urdf.parent / mesh.get("filename", "") for mesh in meshes]
+        found = files[link.get("name")] = []
+        for visual in link.findall("visual"):
+            (x, y, z), quaternion = origin(visual)
+            pose = np.eye(4)
+            pose[:3, :3] = matrix_from_quaternion(torch.tensor(quaternion, dtype=torch.float64)).numpy()
+            pose[:3, 3] = x, y, z
+            for mesh in visual.findall("geometry/mesh"):
+                scale = numbers(mesh, "scale") if "scale" in mesh.attrib else (1.0, 1.0, 1.0)
+                found.append((robot.urdf.parent / mesh.get("filename", ""), pose @ np.diag([*scale, 1.0])))
     return files
 
 
-def _link_mesh(robot: RobotDescription, link: str, visuals: dict[str, list[Path]]) -> trimesh.Trimesh | None:
-    parts = [part for path in visuals.get(link, []) if path.is_file() for part in _coloured(path)]
+def _link_mesh(robot: RobotDescription, link: str, visuals: dict[str | None, list[Placed]]) -> trimesh.Trimesh | None:
+    parts = [_moved(part, to) for path, to in visuals.get(link, []) if path.is_file() for part in _coloured(path)]
     parts = parts or [painted(shape_mesh(shape), PLAIN) for shape in robot.shapes.get(link, ())]
     return joined(parts) if parts else None
+
+
+def _moved(mesh: trimesh.Trimesh, transform: Float[np.ndarray, "4 4"]) -> trimesh.Trimesh:
+    """The mesh itself, or a copy that is elsewhere."""
+    return mesh if np.array_equal(transform, np.eye(4)) else mesh.copy().apply_transform(transform)
 
 
 @cache

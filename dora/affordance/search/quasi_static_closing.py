@@ -109,7 +109,8 @@ def close_hand(
     result = close_and_load(model, steps, quality, load, np.array(DIRECTIONS), end, final, command)
     found = torch.from_numpy(result).to(wrist)
     joints = opened.clone()
-    joints[:, order] = torch.from_numpy(final).to(opened)
+    real = hand.axes.any(-1).cpu()  # padding stands for no joint
+    joints[:, order[real]] = torch.from_numpy(final).to(opened)[:, real]
     return ClosedHand(found[:, 0], found[:, 2:], found[:, 1], torch.from_numpy(end).to(wrist), joints)
 
 

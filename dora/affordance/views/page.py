@@ -42,7 +42,8 @@ class Filter:
         classes: grasp classes that are shown.
         validity: "all", "valid" or "not valid".
         term: energy term to filter by; None for no such filter.
-        share: share of the candidates of all classes with the lowest values of `term` that are shown, 0 to 1 [1].
+        share: share of the candidates of all classes with the lowest values of `term` that are shown, 0 to 1 [1]; those
+            without a value of it are shown with 1 only.
     """
 
     classes: frozenset[str]
@@ -57,7 +58,7 @@ class Filter:
             mask = mask & (candidates.valid == (self.validity == VALID))
         if self.term is not None:
             value = candidates.energy[self.term]
-            mask = mask & (value <= torch.quantile(value, self.share))
+            mask = mask & (value <= torch.nanquantile(value, self.share)) if self.share < 1 else mask
         return mask.nonzero().squeeze(1)
 
 

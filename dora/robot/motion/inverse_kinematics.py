@@ -114,8 +114,13 @@ class InverseKinematics:
             )
         self.start = torch.tensor(np.asarray(home), dtype=torch.float32)
         self.lower, self.upper = self.chain.lower + LIMIT_MARGIN, self.chain.upper - LIMIT_MARGIN
-        first = robot.model.chain(robot.wrist_link)[0]
-        self._axis = torch.tensor(first.origin @ _frame_about(first.axis), dtype=torch.float32)
+        frame = np.eye(4)
+        for joint in robot.model.chain(robot.wrist_link):
+            frame = frame @ joint.origin
+            if joint.moves:
+                frame = frame @ _frame_about(joint.axis)
+                break
+        self._axis = torch.tensor(frame, dtype=torch.float32)
         generator = torch.Generator().manual_seed(seed)
         share = torch.rand(TABLE_SIZE, len(home), generator=generator)
         self._table = self.lower + share * (self.upper - self.lower)

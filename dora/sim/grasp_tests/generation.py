@@ -125,7 +125,7 @@ def generate(
         valid = (found.penetration <= test_settings.penetration) & (found.contact_finger > 0).any(1)
     end = time.perf_counter()
     tested = repr(test_settings) if simulate else None
-    origin = {"search": found.settings, "region": region, "seed": seed, "grasp_test": tested}
+    origin = {"search": found.settings, "region": region, "seed": seed, "grasp_test": tested, "mass_kg": obj.mass}
     candidates = replace(found, valid=valid, settings=json.dumps(origin))
     return Generated(candidates, num, region, seed, between - start, end - between, verdict, voting)
 

@@ -130,7 +130,7 @@ class MicrowaveTask(Task):
     def build(self, scene: TaskScene, name: str, scale: Float[np.ndarray, " n"]) -> Actor | Link:
         """The microwave around its handle, and the cube."""
         obj = load_object(name)
-        self._reach: dict[tuple[str, int], OvenReach] = {}
+        self._reach: dict[tuple[str, int], tuple[GraspCandidates, OvenReach]] = {}
         if name == "cube":
             return build_box(scene.scene, obj, scale, BLUE, sapien.Pose([*self.config.centre, obj.support]))
         self.oven = HingedObject(scene.scene, obj, oven_mount())
@@ -190,8 +190,9 @@ class MicrowaveTask(Task):
                 way = opening_way(hinge, handle, c.opening.standoff, c.opening.target)
             else:
                 way = placing_way(place.front, place.depth, height)
-            self._reach[key] = oven_reach(arm, candidates, way, c.oven, r.oven_position, r.oven_rotation)
-        return self._reach[key].mask(p, q)
+            found = oven_reach(arm, candidates, way, c.oven, r.oven_position, r.oven_rotation)
+            self._reach[key] = candidates, found  # kept, so that no other set gets the same id
+        return self._reach[key][1].mask(p, q)
 
     def masses(self, name: str, nominal: Float[Tensor, " b"], u: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
         return nominal if name == "microwave" else super().masses(name, nominal, u)
