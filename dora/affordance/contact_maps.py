@@ -18,7 +18,7 @@ from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.objects.catalogue import load_object
 from dora.robot import load_robot
 
-LOOKED_AT, ALIKE = 4, 0.9
+LOOKED_AT, ALIKE = 4, 0.5
 """Candidates whose stored maps are looked at, and the share of touched points that have to agree with maps made anew;
 rounding on another processor moves a few, the points of another mesh agree in none [1]."""
 
