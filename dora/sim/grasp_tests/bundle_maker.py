@@ -179,7 +179,6 @@ class SetMaker:
         good = found.valid & (found.self_penetration < STANDARD.strict_self_penetration)
         if label is not None:
             good &= found.of_class(self.obj.classes[self.obj.label_index(label)])
-        good = good if usable is None else good & usable(found)
         if not good.any():
             return None
         found, free = free_approaches(found.select(good), self.reach)
@@ -192,6 +191,11 @@ class SetMaker:
             if not feasible.any():
                 return None
             found = found.select(feasible)
+        if usable is not None:  # with the approaches that they have now
+            chosen = usable(found)
+            if not chosen.any():
+                return None
+            found = found.select(chosen)
         verdict = validate(found, self.obj, self.robot, progress=self.phase(f"validate {label or 'any region'}"))
         return found.select(verdict.strict) if verdict.strict.any() else None
 
