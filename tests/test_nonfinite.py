@@ -179,6 +179,19 @@ def test_the_contacts_of_a_bad_row_do_not_count():
     env.close()
 
 
+def test_forces_that_are_sound_stay_when_a_row_is_put_back():
+    """The nail's resistance: without it the next blow would drive it further."""
+    env = make("DoraHammer-v1")
+    nail = env.task.nail
+    env.step(zero(env))
+    for force in (np.nan, 3e38):
+        joints(force)(env, "qf")
+        assert env.step(zero(env))[4]["nonfinite"][BAD]
+        assert nail._bodies[BAD].qf.tolist() == [-nail.settings.resistance]
+        assert not robot_of(env).qf.any()
+    env.close()
+
+
 def test_last_states_are_written_to_few_files(folder: Path, monkeypatch: pytest.MonkeyPatch):
     said: list[str] = []
     monkeypatch.setattr(records.logger, "warning", said.append)

@@ -21,6 +21,9 @@ SPIN = 1e4
 """Largest angular velocity of a body, and velocity of a joint, that is no blow-up [rad/s]."""
 DISTANCE = 1e4
 """Largest coordinate of a body that is no blow-up [m]; kinematic bodies may be anywhere, for example hidden."""
+FORCE = 1e6
+"""Largest force [N] or torque [N m] on a joint that an environment keeps when it is put back; a task may hold a joint
+by one, such as a nail's resistance."""
 HISTORY = 16
 """Control steps whose states are kept for the record [1]."""
 PICTURES = ("sensor_data", "sensor_param", "pointcloud")
@@ -143,7 +146,8 @@ class StateGuard:
             self._scenes[environment].unpack_poses(moment.poses[environment])
         for row in self._layout.articulations:
             if row.environment == environment:
-                row.articulation.set_qf(np.zeros(row.dof, np.float32))  # not part of the packed state
+                force = np.asarray(row.articulation.qf)  # not part of the packed state
+                row.articulation.set_qf(np.where(np.abs(force) <= FORCE, force, 0.0).astype(np.float32))
         self._stepper.discard(environment)
 
     def _record(self, environment: int) -> None:
