@@ -23,8 +23,10 @@ from mani_skill.utils.structs.types import SimConfig
 
 from dora.arguments import checked_truth
 from dora.errors import InputError, shown, suggestion
+from dora.robot import available_robots
 from dora.sim.batch.hooks import BACKEND, batched_by_default
 from dora.sim.cameras import check_settings
+from dora.sim.robots import register_robot
 
 SIM_BACKENDS = ("auto", BACKEND, *backends.sim_backend_name_mapping)
 """Values of `sim_backend`; those of CUDA may have the number of a device, as in "physx_cuda:1"."""
@@ -181,6 +183,8 @@ def _checked_robots(robots: Any) -> Any:
             continue
         if not isinstance(name, str):
             raise InputError(f"robot_uids must be the name of a robot, or a tuple of names, not {shown(robots)}.")
+        if name not in REGISTERED_AGENTS and name in available_robots():
+            register_robot(name)  # its folder came, or was mended, since
         if name not in ("none", *REGISTERED_AGENTS):
             raise InputError(f"there is no robot {name!r}: {suggestion(name, REGISTERED_AGENTS)}")
     return tuple(robots) if isinstance(robots, list) else robots

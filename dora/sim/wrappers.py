@@ -15,6 +15,7 @@ from mani_skill.utils import common, sapien_utils, tree
 from mani_skill.utils.registration import TimeLimitWrapper
 from mani_skill.utils.wrappers import record
 from mani_skill.utils.wrappers.cached_reset import CachedResetWrapper
+from mani_skill.utils.wrappers.frame_stack import FrameStack
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 from dora.arguments import as_tensor
@@ -44,6 +45,7 @@ def install_wrappers() -> None:
         (RecordEpisode, "step", _step),
         (common, "_batch", _batch),
         (CachedResetWrapper, "__init__", _cache),
+        (FrameStack, "reset", _reset_of_frames),
         (BaseEnv, "render", _render),
         (BaseEnv, "_setup_sensors", _setup_sensors),
         (sapien_utils, "create_viewer", _create_viewer),
@@ -185,6 +187,16 @@ def _reset(original: Callable) -> Callable:
             options = checked_options(options, self.num_envs, self.base_env.device) or None
             seed = seed.tolist() if isinstance(seed, np.generic | np.ndarray | torch.Tensor) else seed
         return original(self, *args, seed=seed, options=options, **kwargs)
+
+    return reset
+
+
+def _reset_of_frames(original: Callable) -> Callable:
+    def reset(self: FrameStack, seed: Any = None, options: Any = None) -> Any:
+        """ManiSkill's, which refuses a partial reset, also one whose `env_idx` is a mask."""
+        if _is_ours(self):
+            options = checked_options(options, self.base_env.num_envs, self.base_env.device) or None
+        return original(self, seed=seed, options=options)
 
     return reset
 

@@ -51,18 +51,18 @@ def check_action(env: Any, action: Any) -> None:
         raise InputError("The environment has no robot: pass None as the action.")
     if isinstance(action, Mapping) and "control_mode" in action:
         if (modes := getattr(env.agent, "supported_control_modes", None)) is None:
-            raise _several(env._orig_single_action_space)
+            raise _several(env.agent.single_action_space)
         if action["control_mode"] not in modes:
             mode = action["control_mode"]
             raise InputError(f"The action is for the unknown control_mode {mode!r}: {suggestion(mode, modes)}")
         if action["control_mode"] == env.agent.control_mode:
-            check_array(action.get("action"), env._orig_single_action_space, env.num_envs)
+            check_array(action.get("action"), env.agent.single_action_space, env.num_envs)
         else:
             _switch_mode(env, action["control_mode"], action.get("action"))
     elif isinstance(action, Mapping):
         _check_robots(env, action)
     elif isinstance(action, np.ndarray | torch.Tensor):
-        check_array(action, env._orig_single_action_space, env.num_envs, "")
+        check_array(action, env.agent.single_action_space, env.num_envs, "")
 
 
 def _switch_mode(env: Any, mode: str, action: Any) -> None:
@@ -82,7 +82,7 @@ def _switch_mode(env: Any, mode: str, action: Any) -> None:
 
 
 def _check_robots(env: Any, action: Mapping[Any, Any]) -> None:
-    space = env._orig_single_action_space
+    space = env.agent.single_action_space
     if not isinstance(space, spaces.Dict):
         raise InputError(
             f"The action is a dictionary but there is one robot only: pass an array of shape "

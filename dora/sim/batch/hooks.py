@@ -64,6 +64,7 @@ def install() -> None:
         (BaseEnv, "step", _step),
         (BaseEnv, "_step_action", _step_action),
         (BaseEnv, "reset", partial(_where_batched, resets.reset)),
+        (BaseEnv, "get_state_dict", partial(_where_batched, resets.get_state_dict)),
         (BaseEnv, "set_state", partial(_where_batched, resets.set_state)),
         (BaseEnv, "set_state_dict", partial(_where_batched, resets.set_state_dict)),
         (Articulation, "get_collision_meshes", _get_meshes),

@@ -4,6 +4,7 @@ import difflib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
+from math import prod
 from typing import Any
 
 import torch
@@ -106,9 +107,14 @@ def reset(original: Callable, env: Any, seed: Any = None, options: Any = None) -
     if "obs" in start:  # ManiSkill writes into the observation that it returned last
         env._last_obs = common.torch_clone_dict(env._last_obs)
     states = start.get(STATES)
-    targets = states.get("controller", {}) if isinstance(states, dict) else {}
+    targets = states.get("controller", {}) if isinstance(states, dict) else _controllers_in(env, states)
+    rebuilds = _rebuilds(env, options)
     with _controllers_of(env, rows, targets):
-        return original(env, seed=seeds, options=options)
+        obs, info = original(env, seed=seeds, options=options)
+    if rebuilds and targets and _has_usual_states(env):  # the robots are new ones
+        _restore_targets(env, targets)
+        env._last_obs = obs = env.get_obs(info)
+    return obs, info
 
 
 def _rebuilds(env: Any, options: Mapping[str, Any]) -> bool:
@@ -215,6 +221,35 @@ def _reset_controller(
         controller.set_state(_merged(controller.get_state(), targets, rows))
 
 
+def _controllers_in(env: Any, flat: Tensor | None) -> dict[str, Any]:
+    """The state of the controllers in rows as of `get_state`; empty if they have none."""
+    whole = env._init_raw_state if flat is not None else {}
+    widths = [prod(leaf.shape[1:]) for leaf in _leaves(whole)]
+    if flat is None or "controller" not in whole or flat.shape[-1] != sum(widths):
+        return {}
+    columns = flat.reshape(-1, flat.shape[-1]).split(widths, -1)
+    return _like(whole, iter(columns))["controller"]
+
+
+def _leaves(state: Mapping[str, Any]) -> Iterator[Tensor]:
+    for part in state.values():
+        yield from _leaves(part) if isinstance(part, Mapping) else [part]
+
+
+def _like(state: Mapping[str, Any], leaves: Iterator[Tensor]) -> dict[str, Any]:
+    """A state with other leaves, in the same order."""
+    return {name: _like(p, leaves) if isinstance(p, Mapping) else next(leaves) for name, p in state.items()}
+
+
+def _restore_targets(env: Any, targets: Mapping[str, Any]) -> None:
+    """Gives all environments' controllers the targets of a state."""
+    rows, several = torch.arange(env.num_envs, device=env.device), isinstance(env.agent.controller, dict)
+    for uid, controller in (env.agent.controller if several else {"": env.agent.controller}).items():
+        own = targets.get(uid, {}) if several else targets
+        if own:
+            controller.set_state(_merged(controller.get_state(), own, rows))
+
+
 def _merged(state: Mapping[str, Any], new: Mapping[str, Any], rows: Tensor) -> dict[str, Any]:
     """A state of controllers with some rows replaced by those of another one, as far as it has them."""
     out = dict(state)
@@ -228,6 +263,18 @@ def _merged(state: Mapping[str, Any], new: Mapping[str, Any], rows: Tensor) -> d
 
 
 # ---- states --------------------------------------------------------------------------------------
+
+
+def get_state_dict(original: Callable, env: Any) -> dict[str, Any]:
+    """ManiSkill's `get_state_dict`, which does not change with the controllers whose targets it holds."""
+    state = original(env)
+    return state | {name: _cloned(state[name]) for name in ("controller",) if name in state}
+
+
+def _cloned(state: Any) -> Any:
+    if isinstance(state, Mapping):
+        return {name: _cloned(part) for name, part in state.items()}
+    return state.clone() if isinstance(state, Tensor) else state
 
 
 def set_state_dict(original: Callable, env: Any, state: Any, env_idx: Any = None) -> None:
@@ -337,7 +384,7 @@ def _checked_flat(env: Any, state: Any, count: int) -> Tensor:
     """
     flat = as_tensor(state, "the state", env.device)
     widths = [values.shape[-1] for kind in KINDS for values in env._init_raw_state.get(kind, {}).values()]
-    needed, whole = sum(widths), env.get_state().shape[1]
+    needed, whole = sum(widths), sum(prod(leaf.shape[1:]) for leaf in _leaves(env._init_raw_state))
     size = needed if flat.ndim and flat.shape[-1] == needed else whole
     flat = rows_of(flat, count, size, "the state")
     for body in flat[:, :needed].split(widths, -1):

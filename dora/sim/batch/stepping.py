@@ -214,7 +214,10 @@ class Stepper:
         self.changed([environment])
 
     def set_targets(self, setters: Setters, numbers: np.ndarray, values: np.ndarray, environments: np.ndarray) -> None:
-        """Call ``setters[numbers[k]](values[k])`` for environment ``environments[k]``, now or before its next step."""
+        """Call ``setters[numbers[k]](values[k])`` for environment ``environments[k]``, now or before its next step.
+        Steps that are pending are executed with the targets of before."""
+        if self._waiting:
+            self.flush()
         self._targets.add(setters, numbers, values, environments)
         self._targets_stale = True
         if not self._limit:
