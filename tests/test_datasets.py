@@ -22,6 +22,7 @@ from dora import parallel
 from dora.configs import plain
 from dora.datasets.episodes import Plan, make_batch, roll_out
 from dora.datasets.facts import facts_of
+from dora.datasets.hdf5_files import undisturbed
 from dora.datasets.record import FORMATS, check_possible, new_folder, record_dataset
 from dora.datasets.sources import find_source
 from dora.errors import InputError
@@ -226,6 +227,56 @@ def test_sigterm_leaves_nothing(tmp_path: Path):
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 128 + signal.SIGTERM
     assert list(tmp_path.iterdir()) == []
+
+
+DISTURBED = """
+import os, signal, sys
+import numpy as np
+from pathlib import Path
+from dora.datasets.hdf5_files import ForgivingFile, open_undisturbed, undisturbed
+
+def end(number, frame):
+    raise SystemExit(128 + number)
+
+signal.signal(signal.SIGTERM, end)
+calls, at = [0], int(sys.argv[2])
+
+class Disturbed(ForgivingFile):
+    def seek(self, *arguments):
+        calls[0] += 1
+        if calls[0] == at:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return super().seek(*arguments)
+
+with Disturbed(Path(sys.argv[1])) as below:
+    with open_undisturbed(below) as file:
+        for k in range(5):
+            with undisturbed():
+                file.create_dataset(str(k), data=np.arange(2000.0))
+            below.check()
+"""
+"""Writes an HDF5 file, and gets SIGTERM in the nth call that HDF5 makes."""
+
+
+@pytest.mark.parametrize("at", [1, 5, 9, 14])
+def test_a_signal_within_hdf5_is_answered_after_it(tmp_path: Path, at: int):
+    done = subprocess.run(
+        [sys.executable, "-c", DISTURBED, str(tmp_path / "a.h5"), str(at)], capture_output=True, text=True
+    )
+    assert done.returncode == 128 + signal.SIGTERM, done.stderr
+    assert done.stderr == ""
+
+
+def test_signals_wait_for_the_end_of_what_may_not_be_disturbed(tmp_path: Path):
+    came: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, frame: came.append(number))
+    try:
+        with undisturbed():
+            signal.raise_signal(signal.SIGTERM)
+            assert came == []
+        assert came == [signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @pytest.mark.parametrize(

@@ -182,6 +182,17 @@ def test_a_damaged_recording_leaves_the_present_player(recording: Path, tmp_path
     watched.session.stop()
 
 
+def test_a_recording_is_played_at_the_rate_at_which_it_was_made(recording: Path, tmp_path: Path):
+    copy = damaged(recording, tmp_path, "")
+    index = json.loads(copy.with_suffix(".json").read_text())
+    index["env_info"]["env_kwargs"]["sim_config"] = {"control_freq": 10, "sim_freq": 200}
+    copy.with_suffix(".json").write_text(json.dumps(index))
+    watched = Watched("DoraCube-v1", [recorded(Recording.open(copy))])
+    task = watched.env.unwrapped
+    assert (task.control_freq, task.config.control_frequency, task.sim_freq) == (10, 10, 200)
+    watched.session.stop()
+
+
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [

@@ -1,5 +1,6 @@
 """Sweeps: none is lost or trained twice, whatever happens."""
 
+import dataclasses
 import io
 import os
 import signal
@@ -154,6 +155,21 @@ def test_a_folder_with_other_settings_is_refused_before_anything_is_trained(tmp_
     other = rows_of("paper", envs=["DoraCube-v1"], agents=["ppo"], guidance=["affordance"], seeds=[0], episodes=7)
     with pytest.raises(InputError, match="holds a run with other settings"):
         Sweep(other, tmp_path).run(fake("well"), nothing, nothing)
+
+
+def test_a_run_of_a_larger_budget_is_refused_and_one_of_a_smaller_one_goes_on(tmp_path: Path):
+    """It would go on to its own end, and be no run of the table."""
+    rows = few(1)
+    Sweep(rows, tmp_path).run(fake("well"), nothing, nothing)
+    less, more = (
+        [dataclasses.replace(row, config=dataclasses.replace(row.config, total_steps=steps)) for row in rows]
+        for steps in (rows[0].config.total_steps // 2, 2 * rows[0].config.total_steps)
+    )
+    with pytest.raises(InputError, match=f"holds a run of {rows[0].config.total_steps:,} steps, and"):
+        Sweep(less, tmp_path).run(fake("well"), nothing, nothing)
+    sweep = Sweep(more, tmp_path)
+    sweep.run(fake("well"), nothing, nothing)
+    assert states(sweep) == [State.DONE]
 
 
 # --------------------------------------------------------------- the command

@@ -4,10 +4,36 @@ The HDF5 library does not let go of a file that it cannot write: h5py prints a p
 segmentation fault. Here it never meets an error; who writes asks for it.
 """
 
+import contextlib
 import io
 import os
+import signal
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import h5py
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Context of calls of HDF5, in which Ctrl-C and SIGTERM wait until its end: an exception that a signal raises in
+    what HDF5 calls here would end in a segmentation fault, too. Elsewhere than in the main thread none arrives."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[tuple[int, Any]] = []
+    before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        for number in before:
+            signal.signal(number, lambda *arrived: came.append(arrived))
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        if came:
+            signal.raise_signal(came[0][0])
 
 
 class ForgivingFile(io.RawIOBase):
@@ -101,3 +127,22 @@ class ForgivingFile(io.RawIOBase):
         super().close()
         if descriptor >= 0:
             os.close(descriptor)
+
+
+@contextlib.contextmanager
+def open_undisturbed(below: ForgivingFile, **options: Any) -> Iterator[h5py.File]:
+    """An HDF5 file in another one, which no signal disturbs while it is begun and closed.
+
+    Args:
+        below: where it is written.
+        options: of `h5py.File`.
+    """
+    file = None
+    try:
+        with undisturbed():
+            file = h5py.File(below, "w", **options)
+        yield file
+    finally:
+        if file is not None:
+            with undisturbed():
+                file.close()

@@ -18,7 +18,7 @@ from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from dora import registration as registration
 from dora.datasets.episodes import Episode
 from dora.datasets.facts import Facts
-from dora.datasets.hdf5_files import ForgivingFile
+from dora.datasets.hdf5_files import ForgivingFile, open_undisturbed, undisturbed
 from dora.files import write_json
 
 VERSION = "0.5.4"
@@ -61,9 +61,10 @@ def write_minari(
     (folder / DATA).parent.mkdir()
     steps, count = 0, 0
     with ForgivingFile(folder / DATA) as below:
-        with h5py.File(below, "w", track_order=True) as file:
+        with open_undisturbed(below, track_order=True) as file:
             for count, episode in enumerate(episodes, 1):
-                _write_episode(file.create_group(f"episode_{count - 1}"), count - 1, episode)
+                with undisturbed():
+                    _write_episode(file.create_group(f"episode_{count - 1}"), count - 1, episode)
                 steps += len(episode)
                 below.check()
         below.check()

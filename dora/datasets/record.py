@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import h5py
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 from dora.arguments import LARGEST_SEED
 from dora.datasets.episodes import Episode, Plan, Source, make_batch, roll_out
 from dora.datasets.facts import Facts, facts_of
-from dora.datasets.hdf5_files import ForgivingFile
+from dora.datasets.hdf5_files import ForgivingFile, open_undisturbed, undisturbed
 from dora.datasets.lerobot import write_lerobot
 from dora.datasets.minari import write_minari
 from dora.datasets.tables import require_pyarrow
@@ -138,7 +137,8 @@ def record_dataset(
                 """What the source does, episode by episode, counted; OSError on a disk that is full."""
                 for row, episode in roll_out(env, source.act, plan, progress):
                     if recorder is not None and below is not None:
-                        recorder.flush_trajectory(env_idxs_to_flush=[row])
+                        with undisturbed():
+                            recorder.flush_trajectory(env_idxs_to_flush=[row])
                         below.check()
                     summary.count(episode)
                     table.append({"seed": episode.seed, "steps": len(episode), "success": episode.success})
@@ -187,6 +187,6 @@ def _recorder(env: gym.Env, folder: Path, source: Source) -> Iterator[tuple[Reco
     recorder._h5_file.close()
     recorder._json_path = str(folder / f"{NAME}.json")  # theirs replaces ".h5" in the whole path
     with ForgivingFile(folder / f"{NAME}.h5") as below:
-        with h5py.File(below, "w") as recorder._h5_file:
+        with open_undisturbed(below) as recorder._h5_file:
             yield recorder, below
         below.check()

@@ -29,7 +29,7 @@ MOST_MEMBERS, DEEPEST = 1000, 10
 """Largest number of arrays and groups of an episode, and depth of groups in each other."""
 MOST_SEED = 2**32 - 1
 """Largest seed."""
-KEPT = ("guidance", "guidance_parts", "hand_joints", "preset", "config", "control_mode", "robot_uids")
+KEPT = ("guidance", "guidance_parts", "hand_joints", "preset", "config", "control_mode", "robot_uids", "sim_config")
 """Arguments of a task that say what its actions and states mean; the others are of the machine that recorded."""
 SUMS = ".sha256"
 """Ending of the file with the checksums of a trajectory file and of its index, which lies beside them."""

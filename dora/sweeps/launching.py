@@ -64,6 +64,11 @@ def check_folder(row: Row, folder: Path) -> RunConfig | None:
             f"{folder} holds a run with other settings (of another version of the task or of the learner): "
             "move it away, or choose another --out."
         )
+    if stored.total_steps > row.config.total_steps:
+        raise InputError(
+            f"{folder} holds a run of {stored.total_steps:,} steps, and {row.config.total_steps:,} are asked for: give "
+            f"--total-steps {stored.total_steps}, move it away, or choose another --out."
+        )
     return stored
 
 

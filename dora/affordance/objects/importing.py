@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import os
+import xml.etree.ElementTree as ElementTree
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +29,8 @@ from dora.reading import read_bytes
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Factor from each unit of length to metres [m]."""
+UNITS_OF_3MF = {"meter": "m", "centimeter": "cm", "millimeter": "mm", "inch": "in"}
+"""What 3MF files call them; millimetres are meant where a file says nothing."""
 SMALLEST, LARGEST = 0.005, 2.0
 """Range of the longest side of an object, outside of which its unit is most likely wrong [m]."""
 USUAL = (0.01, 0.6)
@@ -58,7 +62,7 @@ def import_object(
         labels: file of labels, see `dora.affordance.objects.labels.read_labels`; if None, the regions are the named
             bodies of the file, else its materials, else the whole mesh.
         scale: factor of all lengths [1].
-        units: unit of length of the file, one of `UNITS`; glTF files are in metres.
+        units: unit of length of the file, one of `UNITS`; glTF files are in metres, 3MF files in what they say.
         mass: mass [kg]; an estimate if None, see `dora.affordance.objects.surfaces.weighing`.
         threshold: concavity of the convex decomposition, see `dora.affordance.objects.decomposition.decompose` [1].
         cache_dir: folder of cached decompositions; the default one if None.
@@ -117,6 +121,7 @@ def import_mesh(
         raise InputError(f"the scale of {path} is {scale}; give a positive number.")
     check_weight(path, mass, density)
     raw, names = read_mesh(path, keep_order=labels is not None)
+    units = _unit_of(path, units)
     _check_size(raw, path, scale, units)
     given = (
         FaceLabels.from_names(names, source=str(path))
@@ -251,6 +256,32 @@ def _parts(scene: trimesh.Scene, path: Path) -> list[tuple[str, trimesh.Trimesh]
         if len(set(names)) > 1:
             return [(name, part) for name, (_, _, part) in zip(names, placed, strict=True)]
     return [(WHOLE, part) for _, _, part in placed]
+
+
+def _unit_of(path: Path, units: str) -> str:
+    """The unit of a file: that of a 3MF file is the one that it states, unless metres are its own.
+
+    Raises:
+        InputError: it states another one than is asked for, or one that is not in `UNITS`.
+    """
+    if path.suffix.lower() != ".3mf":
+        return units
+    with zipfile.ZipFile(path) as archive:
+        models = [name for name in archive.namelist() if name.lower().endswith(".model")]
+        stated = {_stated_unit(archive, name) for name in models} or {"millimeter"}
+    unit = min(stated)
+    if len(stated) > 1 or unit not in UNITS_OF_3MF:
+        raise InputError(f"{path} is in {' and '.join(sorted(stated))}: export it in millimeters.")
+    if units not in ("m", UNITS_OF_3MF[unit]):
+        raise InputError(f"{path} says that it is in {unit}, and --units is {units}: leave --units out.")
+    return UNITS_OF_3MF[unit]
+
+
+def _stated_unit(archive: zipfile.ZipFile, name: str) -> str:
+    with archive.open(name) as stream:
+        for _, root in ElementTree.iterparse(stream, ("start",)):
+            return root.get("unit", "millimeter")
+    return "millimeter"
 
 
 def _check_size(mesh: trimesh.Trimesh, path: Path, scale: float, units: str) -> None:

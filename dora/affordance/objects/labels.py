@@ -218,6 +218,12 @@ def _from_yaml(path: Path, centers: np.ndarray) -> FaceLabels:
                 f"region {shown(name)} of {path} holds no face; the mesh reaches from "
                 f"{centers.min(0).round(4).tolist()} to {centers.max(0).round(4).tolist()} in its coordinates."
             )
+        if not (inside & free).any():
+            before = ", ".join(shown(each) for each in dict.fromkeys(names[inside]))
+            raise InputError(
+                f"region {shown(name)} of {path} holds no face that is not in an earlier region ({before}): a face "
+                "belongs to the first one that has it, so put it before those."
+            )
         names[inside & free] = name
         free &= ~inside
     return FaceLabels.from_names(names.tolist(), _target(path, content), str(path))

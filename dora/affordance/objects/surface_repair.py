@@ -18,6 +18,8 @@ MOST_FILLED, MOST_FILLED_DEEP = 0.53, 0.65
 """Largest ratios of the area that closes openings to that of the mesh, of shallow and of deep ones [1]."""
 DEEP = 0.06
 """Ratio of volume to area^1.5 from which what is closed is deep; half a ball has 0.072, a shallow tray 0.04 [1]."""
+MOST_OUTSIDE = 0.005
+"""Largest ratio of the area of what closes holes, but lies outside of their rims, to that of the mesh [1]."""
 SCRAP = 0.05
 """Share of the area up to which a component that cannot be closed, or is flat, is dropped [1]."""
 MOST_SCRAPS = 0.2
@@ -197,9 +199,14 @@ def _actions(
 def _closed(part: trimesh.Trimesh, labels: np.ndarray, total_area: float, name: str) -> Body:
     """One connected part, closed and oriented outwards; InputError if that is impossible."""
     consistent, area, count = part.is_winding_consistent, part.area, len(part.faces)
-    body, fills = part, _Fills(0, 0)
+    body, fills = part, _Fills(0, 0, 0.0)
     if not part.is_watertight:
         body, labels, fills = _fill(part, labels)
+    if fills.outside > MOST_OUTSIDE * total_area:
+        raise InputError(
+            f"{name} has a hole whose rim turns in on itself, so that what closes it would lie outside of the object: "
+            "close it in a mesh editor."
+        )
     if not body.is_watertight:
         raise InputError(
             f"{name} is not closed and its holes cannot be filled, since edges belong to more than two faces or "
@@ -239,10 +246,12 @@ def _without_buried_openings(bodies: list[Body]) -> list[Body]:
 
 @dataclass(frozen=True)
 class _Fills:
-    """Number of openings that were closed, and of those among them with a modelled rim."""
+    """Number of openings that were closed, of those among them with a modelled rim, and the area of what closes them
+    that lies outside of their rims [m^2]."""
 
     count: int
     mouths: int
+    outside: float
 
 
 def _fill(mesh: trimesh.Trimesh, labels: np.ndarray) -> tuple[trimesh.Trimesh, np.ndarray, _Fills]:
@@ -253,7 +262,7 @@ def _fill(mesh: trimesh.Trimesh, labels: np.ndarray) -> tuple[trimesh.Trimesh, n
     face_of = dict(zip(map(tuple, mesh.edges.tolist()), mesh.edges_face.tolist(), strict=True))
     rims = nx.DiGraph(edges[:, ::-1].tolist())
     vertices, faces, new_labels = [np.array(mesh.vertices)], [np.array(mesh.faces)], [labels]
-    holes = mouths = 0
+    holes, mouths, outside = 0, 0, 0.0
     for rim in nx.weakly_connected_components(rims):
         around = rims.subgraph(rim)
         if any(d != 1 for _, d in around.out_degree()) or any(d != 1 for _, d in around.in_degree()):
@@ -265,8 +274,19 @@ def _fill(mesh: trimesh.Trimesh, labels: np.ndarray) -> tuple[trimesh.Trimesh, n
         new_labels.append(labels[[face_of[b, a] for a, b in pairs.tolist()]])
         holes += 1
         mouths += _is_mouth(mesh.vertices[pairs], mesh.area)
+        outside += _outside(mesh.vertices[pairs])
     closed = trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
-    return closed, np.concatenate(new_labels), _Fills(holes, mouths)
+    return closed, np.concatenate(new_labels), _Fills(holes, mouths, outside)
+
+
+def _outside(rim: np.ndarray) -> float:
+    """Area of the triangles of a fan from a rim of edges (n, 2, 3) to its centre that face the other way: where the rim
+    is not seen whole from there, they lie outside of it, twice."""
+    center = rim[:, 0].mean(0)
+    areas = np.cross(rim[:, 0] - center, rim[:, 1] - center) / 2
+    normal = areas.sum(0)
+    along = areas @ (normal / max(float(np.linalg.norm(normal)), 1e-18))
+    return 2 * float(-along[along < 0].sum())
 
 
 def _is_mouth(rim: np.ndarray, area: float) -> bool:
