@@ -30,6 +30,8 @@ FIRST = "sha256"
 """The same entry in files of the first format: sha256 of the tensors and `METADATA`, not of the rest of the header."""
 ZEROS = "0" * 64
 """What stands for the digits of the digest while it is computed."""
+FRAMES_OF_ROUNDING = 1.5
+"""Frames that the length of a film, which is told in hundredths of a second, may lack [1]."""
 MOST_BYTES = 2**29
 """Size of a safetensors file above which it is not read [bytes]."""
 MOST_HEADER = 4_000_000
@@ -317,3 +319,26 @@ def _first_digest(tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> s
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
         digest.update(value.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()
+
+
+def check_film_is_whole(path: Path, frames: int, rate: float | int) -> None:
+    """Refuse a film that cannot be read, or lacks frames: who writes films is not told how the encoder ended.
+
+    Args:
+        path: of the film, which is closed.
+        frames: that were given to the encoder.
+        rate: frames per second [Hz].
+
+    Raises:
+        InputError: saying so.
+    """
+    import imageio_ffmpeg  # takes its time, and is needed by few
+
+    try:
+        reader = imageio_ffmpeg.read_frames(str(path))
+        seconds = float(next(reader)["duration"])
+        reader.close()
+    except (OSError, RuntimeError, StopIteration):
+        seconds = 0.0
+    if seconds <= 0 or seconds * rate < frames - FRAMES_OF_ROUNDING:
+        raise InputError(f"{path} could not be written whole: make room on the disk, and film again.")

@@ -1,6 +1,5 @@
 """What a run leaves to look at: its policy, TensorBoard's tags and charts, films."""
 
-import contextlib
 import dataclasses
 import errno
 import functools
@@ -9,7 +8,6 @@ import re
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import imageio.v2 as imageio
@@ -131,9 +129,12 @@ def test_a_film_shows_episodes_that_begin_with_successive_seeds(tmp_path: Path, 
         def render(self) -> Tensor:
             return torch.full((1, 16, 16, 3), self.seed, dtype=torch.uint8)
 
-    shown = []
-    writer = SimpleNamespace(append_data=lambda frame: shown.append(int(frame[0, 0, 0])))
-    monkeypatch.setattr(play.imageio, "get_writer", lambda *_, **__: contextlib.nullcontext(writer))
+    shown: list[int] = []
+
+    def kept(path: Path, episodes: Any, rate: int) -> None:
+        shown.extend(int(frame[0, 0, 0]) for frames in episodes for frame in frames)
+
+    monkeypatch.setattr(play, "write_film", kept)
     record(lambda: Filmed(1), None, tmp_path / "a.mp4", 3, first_seed=7)
     length = Filmed(1).max_steps + 1
     assert shown == [7] * length + [8] * length + [9] * length

@@ -16,11 +16,13 @@ from gymnasium.spaces import Box
 
 from dora.datasets.episodes import Episode, Plan
 from dora.datasets.facts import Facts
+from dora.datasets.films import Film
 from dora.datasets.hdf5_files import ForgivingFile
 from dora.datasets.lerobot import write_lerobot
 from dora.datasets.minari import write_minari
 from dora.datasets.record import record_dataset
 from dora.datasets.sources import find_source
+from dora.errors import InputError
 from dora.sim import can_render
 
 ENV = "DoraCube-v1"
@@ -138,6 +140,19 @@ def test_films_show_each_episode_at_its_time_and_states_are_parted(tmp_path: Pat
     observed = np.concatenate([episode.observations[:-1] for episode in episodes])
     np.testing.assert_array_equal(frames["observation.state"], observed[:, :4])
     np.testing.assert_array_equal(frames["observation.environment_state"], observed[:, 4:])
+
+
+def test_a_film_that_is_not_whole_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    close = Film.close
+
+    def cut(self: Film) -> None:
+        close(self)
+        content = self._path.read_bytes()
+        self._path.write_bytes(content[: len(content) // 2])
+
+    monkeypatch.setattr(Film, "close", cut)
+    with pytest.raises(InputError, match="could not be written whole"):
+        write_lerobot(tmp_path, facts(), (invented(*row, pictures=True) for row in EPISODES))
 
 
 def test_a_large_dataset_is_parted_into_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

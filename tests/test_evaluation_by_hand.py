@@ -16,6 +16,7 @@ from torch import Tensor
 from dora.agents.collecting.rollouts import Rollouts
 from dora.agents.collecting.task_env import EpisodeColumns, TaskEnv, TrainingRules, ended_episodes
 from dora.agents.config import PPOConfig, RunConfig
+from dora.agents.evaluation import play
 from dora.agents.evaluation.evaluate import (
     FINAL_SEED,
     MOST_SEEDS,
@@ -150,6 +151,36 @@ def test_a_film_has_the_size_and_the_rate_of_its_task(tmp_path: Path, make: Any,
     assert len(frames) == 2 * 6
     if make is Filmed:
         assert [float(frame.mean()) for frame in frames] == pytest.approx([0, 20, 40, 60, 80, 100] * 2, abs=6)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.0])
+def test_a_film_that_the_encoder_did_not_finish_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
+):
+    """As on a disk that is full; what was there before stays, and nothing else does."""
+    path = tmp_path / "a.mp4"
+    path.write_text("an earlier film")
+    replace = play.check_film_is_whole
+
+    def cut(film: Path, frames: int, rate: int) -> None:
+        content = film.read_bytes()
+        film.write_bytes(content[: int(share * len(content))])
+        replace(film, frames, rate)
+
+    monkeypatch.setattr(play, "check_film_is_whole", cut)
+    with pytest.raises(InputError, match=r"a\.mp4 cannot be written"):
+        record(Filmed, None, path, 2)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
+    assert path.read_text() == "an earlier film"
+
+
+def test_a_film_lacks_no_frame(tmp_path: Path):
+    record(Filmed, None, tmp_path / "a.mp4", 2)
+    play.check_film_is_whole(tmp_path / "a.mp4", 12, 10)
+    with pytest.raises(InputError, match="could not be written whole"):
+        play.check_film_is_whole(tmp_path / "a.mp4", 14, 10)
+    with pytest.raises(InputError, match="could not be written whole"):
+        play.check_film_is_whole(tmp_path / "b.mp4", 1, 10)
 
 
 def test_names_of_films_and_checkpoints(tmp_path: Path):

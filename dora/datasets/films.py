@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dora.datasets.tables import MEGABYTE
+from dora.files import check_film_is_whole
 
 CODEC, PIXELS = "libx264", "yuv420p"
 """Encoder and form of the pixels; each picture has an even number of rows and columns."""
@@ -45,6 +46,7 @@ class Film:
         """Append the pictures of an episode; where they are: chunk, file, and times in the file [s]."""
         if self._writer is not None and self._written > self.size * MEGABYTE:
             self.close()
+            self.check()
             self._number, self._frames = self._number + 1, 0
         chunk, file = divmod(self._number, self.files_per_chunk)
         if self._writer is None:
@@ -70,3 +72,12 @@ class Film:
         if self._writer is not None:
             self._writer.close()
         self._writer = None
+
+    def check(self) -> None:
+        """Refuse a file that the encoder did not finish, once it is closed.
+
+        Raises:
+            InputError: it lacks pictures.
+        """
+        if self._frames:
+            check_film_is_whole(self._path, self._frames, self.rate)

@@ -50,7 +50,7 @@ def write_lerobot(folder: Path, facts: Facts, episodes: Iterable[Episode]) -> No
         episodes: in the order in which they are stored.
 
     Raises:
-        InputError: pyarrow is not installed.
+        InputError: pyarrow is not installed, or a film could not be written whole.
     """
     require_pyarrow()
     writer = _Writer(folder, facts)
@@ -59,6 +59,7 @@ def write_lerobot(folder: Path, facts: Facts, episodes: Iterable[Episode]) -> No
             writer.add(episode)
     finally:
         writer.close()
+    writer.check()
     writer.describe()
 
 
@@ -105,6 +106,11 @@ class _Writer:
         self.table.close()
         for film in self.films.values():
             film.close()
+
+    def check(self) -> None:
+        """Refuse films that are not whole, as `Film.check`."""
+        for film in self.films.values():
+            film.check()
 
     def describe(self) -> None:
         """Write `meta/`: the table of episodes, that of the one task, statistics and `info.json`."""

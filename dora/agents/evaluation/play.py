@@ -1,8 +1,9 @@
 """Evaluation of a checkpoint, and films of a policy."""
 
 import dataclasses
+import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.learner import agents_of, make_learner
 from dora.agents.learners.networks import Policy
 from dora.errors import InputError
+from dora.files import check_film_is_whole
 
 FILMS = (".mp4", ".mov", ".avi", ".mkv", ".wmv", ".gif")
 """Suffixes of films that can be written."""
@@ -115,23 +117,46 @@ def record(
         episodes: number of episodes.
         first_seed: seed of the first one; those of the others follow.
 
+    The film appears when it is whole; an earlier one of that name stays until then.
+
     Raises:
-        InputError: as `check_film`.
+        InputError: as `check_film`, or it cannot be written.
         RuntimeError: if nothing can be rendered, for want of a driver.
     """
     check_film(path)
     task: Any = make_task()
     try:
         act = act or no_correction(len(task.single_action_space.low))
-        path.parent.mkdir(parents=True, exist_ok=True)
-        first = episode_frames(task, act, first_seed)
         rate = getattr(task, "control_freq", FRAMES_PER_SECOND)
-        with imageio.get_writer(path, fps=rate, macro_block_size=8) as writer:
-            for episode in range(episodes):
-                for frame in first if episode == 0 else episode_frames(task, act, first_seed + episode):
-                    writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
+        first = episode_frames(task, act, first_seed)
+        later = (episode_frames(task, act, first_seed + episode) for episode in range(1, episodes))
+        write_film(path, itertools.chain([first], later), rate)
     finally:
         task.close()
+
+
+def write_film(path: Path, episodes: Iterable[Sequence[UInt8[np.ndarray, "h w 3"]]], rate: float | int) -> None:
+    """Write the frames of episodes, one after the other, as a film with so many frames per second [Hz].
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside, count = path.with_name(f".{os.getpid()}-{path.name}"), 0
+    try:
+        with imageio.get_writer(beside, fps=rate, macro_block_size=8) as writer:
+            for frames in episodes:
+                for frame in frames:
+                    writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
+                count += len(frames)
+        if path.suffix.lower() != ".gif":
+            check_film_is_whole(beside, count, rate)
+        os.replace(beside, path)
+    except (OSError, InputError) as error:
+        reason = getattr(error, "strerror", None) or "the encoder did not end well"
+        raise InputError(f"{path} cannot be written ({reason}): make room on the disk, and film again.") from error
+    finally:
+        beside.unlink(missing_ok=True)
 
 
 @torch.no_grad()
