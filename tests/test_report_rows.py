@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,9 @@ import pytest
 from short_runs import BASE, SMALL_PPO, run
 
 from dora.agents.reports.comparison import sections
-from dora.agents.reports.figures import _together
+from dora.agents.reports.figures import COLOURS, OTHERS, _together
 from dora.agents.reports.report import table_rows
-from dora.agents.reports.run_results import find_runs
+from dora.agents.reports.run_results import find_runs, grouped
 
 CONFIG = dataclasses.replace(BASE, learner=SMALL_PPO, total_steps=512, eval_every=256)
 
@@ -74,6 +75,12 @@ def test_curves_of_runs_that_were_evaluated_at_other_steps_are_compared_at_the_s
     assert at.tolist() == [100, 150, 200, 250, 300]
     np.testing.assert_allclose(values[0], at / 500)
     np.testing.assert_allclose(values[1], [0.2, 0.3, 0.4, 0.4, 0.4])
+
+
+def test_no_two_lines_of_a_stored_figure_have_the_same_colour():
+    runs = find_runs(Path(__file__).parents[1] / "results" / "tasks")
+    figures = Counter(group[:2] for group in grouped(runs) if group[2:4] not in COLOURS)
+    assert max(figures.values()) <= len(set(OTHERS) - set(COLOURS.values()))
 
 
 @pytest.mark.parametrize("steps", [1000, 600_000])

@@ -17,7 +17,10 @@ COLOURS = {
     ("SAC", "none"): "#85c1e9",
 }
 """Line colour of each learner with and without guidance."""
-OTHERS = ("#148f77", "#b9770e", "#7d3c98", "#566573", "#d98880", "#2e86c1")
+OTHERS = (
+    "#148f77", "#b9770e", "#7d3c98", "#566573", "#e84393", "#00acc1", "#212121", "#7cb342", "#8d6e63", "#3949ab",
+    "#c0ca33", "#ad1457",
+)  # fmt: skip
 """Line colours of all else, in this order."""
 EPOCHS = 10_000
 """Epochs of the paper's trainings [1]: one of its epochs is this share of a budget."""
