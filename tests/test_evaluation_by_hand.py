@@ -27,7 +27,14 @@ from dora.agents.evaluation.evaluate import (
     run_batch,
 )
 from dora.agents.evaluation.evaluators import Evaluators
-from dora.agents.evaluation.play import check_film, checkpoint_path, episode_frames, evaluate_zero, record
+from dora.agents.evaluation.play import (
+    check_film,
+    checkpoint_path,
+    episode_frames,
+    evaluate_zero,
+    record,
+    write_film,
+)
 from dora.agents.learners.learner import make_learner
 from dora.agents.seeds import TRAINING_SEEDS, seeds_for
 from dora.errors import InputError
@@ -160,14 +167,14 @@ def test_a_film_that_the_encoder_did_not_finish_is_refused(
     """As on a disk that is full; what was there before stays, and nothing else does."""
     path = tmp_path / "a.mp4"
     path.write_text("an earlier film")
-    replace = play.check_film_is_whole
+    is_whole = play.film_is_whole
 
-    def cut(film: Path, frames: int, rate: int) -> None:
+    def cut(film: Path, frames: int, rate: int) -> bool:
         content = film.read_bytes()
         film.write_bytes(content[: int(share * len(content))])
-        replace(film, frames, rate)
+        return is_whole(film, frames, rate)
 
-    monkeypatch.setattr(play, "check_film_is_whole", cut)
+    monkeypatch.setattr(play, "film_is_whole", cut)
     with pytest.raises(InputError, match=r"a\.mp4 cannot be written"):
         record(Filmed, None, path, 2)
     assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
@@ -176,11 +183,21 @@ def test_a_film_that_the_encoder_did_not_finish_is_refused(
 
 def test_a_film_lacks_no_frame(tmp_path: Path):
     record(Filmed, None, tmp_path / "a.mp4", 2)
-    play.check_film_is_whole(tmp_path / "a.mp4", 12, 10)
-    with pytest.raises(InputError, match="could not be written whole"):
-        play.check_film_is_whole(tmp_path / "a.mp4", 14, 10)
-    with pytest.raises(InputError, match="could not be written whole"):
-        play.check_film_is_whole(tmp_path / "b.mp4", 1, 10)
+    assert play.film_is_whole(tmp_path / "a.mp4", 12, 10)
+    assert not play.film_is_whole(tmp_path / "a.mp4", 14, 10)
+    assert not play.film_is_whole(tmp_path / "b.mp4", 1, 10)
+
+
+def test_what_a_task_refuses_while_it_is_filmed_is_said_as_it_is(tmp_path: Path):
+    class Refusing(Filmed):
+        def step(self, action: Tensor) -> Any:
+            if self.elapsed_steps[0] == 3:
+                raise InputError("the action is NaN.")
+            return super().step(action)
+
+    with pytest.raises(InputError, match="^the action is NaN"):
+        write_film(tmp_path / "a.mp4", (episode_frames(Refusing(), no_correction(2), seed) for seed in (1, 2)), 10)
+    assert not list(tmp_path.iterdir())
 
 
 def test_names_of_films_and_checkpoints(tmp_path: Path):

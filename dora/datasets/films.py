@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dora.datasets.tables import MEGABYTE
-from dora.files import check_film_is_whole
+from dora.errors import InputError
+from dora.files import film_is_whole
 
 CODEC, PIXELS = "libx264", "yuv420p"
 """Encoder and form of the pixels; each picture has an even number of rows and columns."""
@@ -79,5 +80,5 @@ class Film:
         Raises:
             InputError: it lacks pictures.
         """
-        if self._frames:
-            check_film_is_whole(self._path, self._frames, self.rate)
+        if self._frames and not film_is_whole(self._path, self._frames, self.rate):
+            raise InputError(f"{self._path} could not be written whole: make room on the disk, and record again.")

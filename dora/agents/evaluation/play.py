@@ -21,7 +21,7 @@ from dora.agents.evaluation.evaluators import Evaluators
 from dora.agents.learners.learner import agents_of, make_learner
 from dora.agents.learners.networks import Policy
 from dora.errors import InputError
-from dora.files import check_film_is_whole
+from dora.files import film_is_whole
 
 FILMS = (".mp4", ".mov", ".avi", ".mkv", ".wmv", ".gif")
 """Suffixes of films that can be written."""
@@ -149,11 +149,11 @@ def write_film(path: Path, episodes: Iterable[Sequence[UInt8[np.ndarray, "h w 3"
                 for frame in frames:
                     writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
                 count += len(frames)
-        if path.suffix.lower() != ".gif":
-            check_film_is_whole(beside, count, rate)
+        if path.suffix.lower() != ".gif" and not film_is_whole(beside, count, rate):
+            raise OSError("the encoder did not end well")
         os.replace(beside, path)
-    except (OSError, InputError) as error:
-        reason = getattr(error, "strerror", None) or "the encoder did not end well"
+    except OSError as error:
+        reason = error.strerror or error
         raise InputError(f"{path} cannot be written ({reason}): make room on the disk, and film again.") from error
     finally:
         beside.unlink(missing_ok=True)

@@ -132,7 +132,7 @@ def _success(cells: Mapping[Cell, list[Run]]) -> Section:
     )
     note = (
         "In brackets the bootstrap interval over seeds and starts, where the episodes of all runs are there. "
-        f"{TOO_NARROW}"
+        + TOO_NARROW
     )
     return Section("Overall success beside the paper's tables II and IV", head, rows, note)
 

@@ -224,21 +224,22 @@ def _reset_controller(
 def _controllers_in(env: Any, flat: Tensor | None) -> dict[str, Any]:
     """The state of the controllers in rows as of `get_state`; empty if they have none."""
     whole = env._init_raw_state if flat is not None else {}
-    widths = [prod(leaf.shape[1:]) for leaf in _leaves(whole)]
+    widths = [prod(leaf.shape[1:]) for leaf in leaves_of(whole)]
     if flat is None or "controller" not in whole or flat.shape[-1] != sum(widths):
         return {}
     columns = flat.reshape(-1, flat.shape[-1]).split(widths, -1)
-    return _like(whole, iter(columns))["controller"]
+    return with_leaves(whole, iter(columns))["controller"]
 
 
-def _leaves(state: Mapping[str, Any]) -> Iterator[Tensor]:
+def leaves_of(state: Mapping[str, Any]) -> Iterator[Tensor]:
+    """The tensors of a state, in its order."""
     for part in state.values():
-        yield from _leaves(part) if isinstance(part, Mapping) else [part]
+        yield from leaves_of(part) if isinstance(part, Mapping) else [part]
 
 
-def _like(state: Mapping[str, Any], leaves: Iterator[Tensor]) -> dict[str, Any]:
+def with_leaves(state: Mapping[str, Any], leaves: Iterator[Tensor]) -> dict[str, Any]:
     """A state with other leaves, in the same order."""
-    return {name: _like(p, leaves) if isinstance(p, Mapping) else next(leaves) for name, p in state.items()}
+    return {name: with_leaves(p, leaves) if isinstance(p, Mapping) else next(leaves) for name, p in state.items()}
 
 
 def _restore_targets(env: Any, targets: Mapping[str, Any]) -> None:
@@ -384,7 +385,7 @@ def _checked_flat(env: Any, state: Any, count: int) -> Tensor:
     """
     flat = as_tensor(state, "the state", env.device)
     widths = [values.shape[-1] for kind in KINDS for values in env._init_raw_state.get(kind, {}).values()]
-    needed, whole = sum(widths), sum(prod(leaf.shape[1:]) for leaf in _leaves(env._init_raw_state))
+    needed, whole = sum(widths), sum(prod(leaf.shape[1:]) for leaf in leaves_of(env._init_raw_state))
     size = needed if flat.ndim and flat.shape[-1] == needed else whole
     flat = rows_of(flat, count, size, "the state")
     for body in flat[:, :needed].split(widths, -1):

@@ -1,7 +1,7 @@
 """Saving and restoring what a task remembers beside the simulator: memory, stages, guides, noise, sizes."""
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from math import inf, prod
 from typing import Any
 
@@ -11,7 +11,16 @@ from torch import Tensor
 
 from dora.arguments import as_tensor, checked_rows, taken, tensors
 from dora.errors import InputError, suggestion
-from dora.sim.batch.resets import KINDS, STATES, check_body, check_finite_state, check_fits, rows_of
+from dora.sim.batch.resets import (
+    KINDS,
+    STATES,
+    check_body,
+    check_finite_state,
+    check_fits,
+    leaves_of,
+    rows_of,
+    with_leaves,
+)  # fmt: skip
 
 RANGES = {"mass": (1e-9, 1e9), "friction": (0.0, 1e9), "scale": (1e-3, 1e3), "elapsed": (0.0, 1e9)}
 """Ranges of numbers of "task" and "memory" in a state, by the last word of their name: masses [kg], friction [1],
@@ -168,24 +177,15 @@ def unflattened(env: Any, flat: Any, env_idx: Any) -> dict[str, Any]:
     rows = as_tensor(flat, "the state", env.device)
     like = env._init_raw_state
     simulator = {kind: like[kind] for kind in KINDS}
-    short = sum(_width(leaf) for leaf in _leaves(simulator))
+    short = sum(_width(leaf) for leaf in leaves_of(simulator))
     like = simulator if rows.ndim and rows.shape[-1] == short else like
-    widths = [_width(leaf) for leaf in _leaves(like)]
+    widths = [_width(leaf) for leaf in leaves_of(like)]
     columns = rows_of(rows, len(_chosen(env, env_idx)), sum(widths), "the state").split(widths, -1)
-    return _filled(like, iter(columns))
+    return with_leaves(like, iter(columns))
 
 
 def _width(leaf: Tensor) -> int:
     return prod(leaf.shape[1:])
-
-
-def _leaves(state: Mapping[str, Any]) -> Iterator[Tensor]:
-    for part in state.values():
-        yield from _leaves(part) if isinstance(part, Mapping) else [part]
-
-
-def _filled(like: Mapping[str, Any], columns: Iterator[Tensor]) -> dict[str, Any]:
-    return {name: _filled(p, columns) if isinstance(p, Mapping) else next(columns) for name, p in like.items()}
 
 
 def restore(env: Any, state: dict, rows: Tensor) -> None:
