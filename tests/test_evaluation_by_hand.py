@@ -195,7 +195,7 @@ def test_what_a_task_refuses_while_it_is_filmed_is_said_as_it_is(tmp_path: Path)
                 raise InputError("the action is NaN.")
             return super().step(action)
 
-    with pytest.raises(InputError, match="^the action is NaN"):
+    with pytest.raises(InputError, match=r"^the action is NaN"):
         write_film(tmp_path / "a.mp4", (episode_frames(Refusing(), no_correction(2), seed) for seed in (1, 2)), 10)
     assert not list(tmp_path.iterdir())
 
