@@ -77,6 +77,13 @@ def extreme_actions(step: int, shape: tuple[int, int], generator: torch.Generato
     return action
 
 
+def extreme_action(space: Any, rows: int, step: int, generator: torch.Generator) -> Any:
+    """`extreme_actions` for the space of one action: by robot where there are several, None where there is none."""
+    if isinstance(space, gym.spaces.Dict):
+        return {name: extreme_action(part, rows, step, generator) for name, part in space.spaces.items()}
+    return None if space is None else extreme_actions(step, (rows, space.shape[0]), generator)
+
+
 def attack(
     env: Any, steps: int, seed: int = 0, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Report:
@@ -90,12 +97,13 @@ def attack(
     """
     generator = torch.Generator().manual_seed(seed)
     env.reset(seed=seed)
-    shape, rounds = (env.num_envs, env.single_action_space.shape[0]), max(steps // env.num_envs, 1)
+    rounds = max(steps // env.num_envs, 1)
     limit = getattr(env, "max_steps", None) or gym.spec(env.spec.id).max_episode_steps or rounds
     episodes = nonfinite = bad = 0
     first, start = memory(), time.monotonic()
     for step in range(rounds):
-        observation, reward, terminated, _, info = env.step(extreme_actions(step, shape, generator))
+        action = extreme_action(getattr(env, "single_action_space", None), env.num_envs, step, generator)
+        observation, reward, terminated, _, info = env.step(action)
         values = [observation, reward, *(v for v in info.values() if torch.is_tensor(v) and v.is_floating_point())]
         finite = torch.stack([v.reshape(env.num_envs, -1).isfinite().all(1) for v in values]).all(0)
         bad += int((~finite).sum())
