@@ -145,7 +145,7 @@ def test_a_report_is_written_where_the_runs_are_unless_another_folder_is_named(
 ):
     asked = []
 
-    def written(runs: Path, out: Path, rules: Any) -> list[Path]:
+    def written(runs: tuple[Path, ...], out: Path, rules: Any) -> list[Path]:
         asked.append((runs, out, rules))
         return [out / "tables.md", out / "report.html"]
 
@@ -153,7 +153,10 @@ def test_a_report_is_written_where_the_runs_are_unless_another_folder_is_named(
     assert call(report, monkeypatch, "runs") == 0
     assert capsys.readouterr().out == "runs/tables.md\nruns/report.html\n"
     assert call(report, monkeypatch, "runs", "--out", "here") == 0
-    assert asked == [(Path("runs"), Path("runs"), present_rules()), (Path("runs"), Path("here"), present_rules())]
+    assert call(report, monkeypatch, "runs", "others", "more") == 0
+    one, three = (Path("runs"),), (Path("runs"), Path("others"), Path("more"))
+    outs = Path("runs"), Path("here"), Path("runs")
+    assert asked == [(runs, out, present_rules()) for runs, out in zip((one, one, three), outs, strict=True)]
 
 
 def test_demonstrations_are_recorded_as_asked_for(

@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dora.agents.reports.comparison import of_the_paper, sections, with_interval
+from dora.agents.reports.comparison import of_the_paper, sections
 from dora.agents.reports.failures import failure_kinds
 from dora.agents.reports.figures import draw_overlap
 from dora.agents.reports.paper import PAPER
 from dora.agents.reports.run_results import Run
+from dora.agents.reports.section import with_interval
 
 Rows = list[list[str]]
 

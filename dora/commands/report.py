@@ -1,4 +1,4 @@
-"""Tables and figures of finished runs: `dora report DIR`."""
+"""Tables and figures of finished runs: `dora report DIR`, or several folders, `dora report DIR DIR --out REPORT`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,14 +17,17 @@ class Arguments:
 
     dir: Annotated[Path, tyro.conf.Positional]
     """Folder that is searched for result.json files."""
+    more: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Further ones, such as that of evaluations under other physics."""
     out: Path | None = None
-    """Folder for the report; the searched folder by default."""
+    """Folder for the report; the first of those by default."""
 
 
 @command
 def main() -> int:
     """Run the command; returns the exit status."""
     arguments = tyro.cli(Arguments, description=__doc__)
-    for path in write_report(arguments.dir, arguments.out or arguments.dir, present_rules()):
+    roots = arguments.dir, *arguments.more
+    for path in write_report(roots, arguments.out or arguments.dir, present_rules()):
         print(path)
     return 0

@@ -19,16 +19,14 @@ from dora.agents.reports.run_results import (
     zero_episodes,
     zero_shares,
 )
-from dora.agents.reports.section import NONE, Section, outcomes_of, rate_of, success_of
-from dora.agents.reports.statistics import Interval, aggregates, crossed_interval, mean_of_curve, paired_difference
+from dora.agents.reports.section import NONE, OVERLAP, Section, outcomes_of, rate_of, success_of, with_interval
+from dora.agents.reports.statistics import aggregates, crossed_interval, mean_of_curve, paired_difference
 
 TOO_NARROW = (
     "Of a few seeds it is too narrow: of three that differ by 1 point (standard deviation) it covers the true mean in "
     "95 of 100 cases, by 2.4 points in 90, by 5 in 84, by 11 in 76."
 )
 """What bootstrap intervals over seeds leave out; measured on invented runs of three seeds and 500 starts."""
-OVERLAP = "penetration_mm"
-"""Column of an episode's largest overlap [mm]."""
 SWITCHES = ("optimised",)
 """Switches of tasks that choose between variants of them."""
 TOLD = (("reorient", "in_hand"), ("hand_action", "fingers"))
@@ -96,12 +94,6 @@ def variant(runs: Sequence[Run]) -> str:
         or (name, str(value)) in TOLD
     ]
     return ", ".join(dict.fromkeys([f"{run.budget / 1000:.0f}k", *words]))
-
-
-def with_interval(value: float, interval: Interval, sign: bool = False) -> str:
-    """A percentage and its interval, given as shares."""
-    form = "+.1f" if sign else ".1f"
-    return f"{100 * value:{form}} [{100 * interval[0]:{form}}, {100 * interval[1]:{form}}]"
 
 
 def _success(cells: Mapping[Cell, list[Run]]) -> Section:

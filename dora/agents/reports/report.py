@@ -6,8 +6,9 @@ from pathlib import Path
 from statistics import mean, stdev
 from urllib.parse import quote
 
-from dora.agents.reports.comparison import OVERLAP, Section, sections
+from dora.agents.reports.comparison import sections
 from dora.agents.reports.figures import draw_curves, draw_overlap
+from dora.agents.reports.physics import apart, physics_section
 from dora.agents.reports.run_results import (
     ALONE,
     DEFAULT_PRESET,
@@ -17,10 +18,12 @@ from dora.agents.reports.run_results import (
     Run,
     find_runs,
     grouped,
+    several,
     shared_mark,
     success_shares,
     zero_shares,
 )
+from dora.agents.reports.section import OVERLAP, Section
 from dora.agents.reports.starts import draw_starts, has_starts, starts_section
 from dora.digests import digest_of
 from dora.files import make_folder, write_bytes
@@ -127,17 +130,18 @@ def file_name(name: str) -> str:
     return quoted if len(quoted) <= LONGEST_FILE else f"{quoted[:LONGEST_FILE]}-{digest_of(name)[:8]}"
 
 
-def write_report(root: Path, out: Path, rules: Mapping[str, int] | None = None) -> list[Path]:
+def write_report(roots: Path | Sequence[Path], out: Path, rules: Mapping[str, int] | None = None) -> list[Path]:
     """Writes `tables.md`, `comparison.md` (sub-tasks, overlap, failures, the paper's tables, starts), curves, overlap
     and success against starts of each task and preset as figures, and `report.html`, which holds all of it, into `out`;
-    returns their paths. `rules` are those of `find_runs`.
+    returns their paths. `roots` and `rules` are those of `find_runs`.
 
     Raises:
         InputError: there is no finished run, a file of one is damaged, or `out` cannot be written.
     """
-    runs = find_runs(root, rules)
-    began, figures = starts_section(runs), dict[str, bytes]()
-    compared = [*sections(runs), *([began] if began.rows else [])]
+    runs, checks = apart(find_runs(roots, rules))
+    figures = dict[str, bytes]()
+    more = physics_section(runs, checks), starts_section(runs)
+    compared = [*sections(runs), *(section for section in more if section.rows)]
     for env, preset in sorted({run.group[:2] for run in runs if run.curve or run.progress}):
         name = env if preset == DEFAULT_PRESET else f"{env}-{preset}"
         figures[f"{file_name(name)}.png"] = draw_curves(runs, env, preset)
@@ -150,7 +154,7 @@ def write_report(root: Path, out: Path, rules: Mapping[str, int] | None = None) 
     texts = {
         "tables.md": f"{tables(runs)}\n{NOTE}\n",
         "comparison.md": "\n".join(map(_markdown, compared)),
-        "report.html": html_page(PAGE, root=root.name, **shown),
+        "report.html": html_page(PAGE, root=" and ".join(root.name for root in several(roots)), **shown),
     }
     contents = {name: text.encode() for name, text in texts.items()} | figures
     make_folder(out)  # everything has been read and drawn

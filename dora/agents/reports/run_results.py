@@ -102,16 +102,32 @@ class Run:
         )
 
 
-def find_runs(root: Path, rules: Mapping[str, int] | None = None) -> list[Run]:
-    """All finished runs under `root`, by path; unfinished ones are left out.
+def find_runs(roots: Path | Sequence[Path], rules: Mapping[str, int] | None = None) -> list[Run]:
+    """All finished runs under one folder or several, by path; unfinished ones are left out.
 
     Args:
-        root: folder that is searched.
+        roots: folders that are searched.
         rules: `definition` of the present rules of tasks, by id; runs of earlier ones are `outdated`.
 
     Raises:
-        InputError: if there is none, or a result file is damaged.
+        InputError: if there is none in one of them, or a result file is damaged.
     """
+    found: dict[Path, Run] = {}
+    for root in several(roots):
+        runs = _runs_under(root, rules or {})
+        if not runs:
+            raise InputError(f"there is no finished run under {root}: point at a folder with result.json files in it.")
+        found |= {run.folder.resolve(): run for run in runs if run.folder.resolve() not in found}
+    return _with_zero(_once(list(found.values())))
+
+
+def several(roots: Path | Sequence[Path]) -> Sequence[Path]:
+    """One folder or several as a sequence."""
+    return [roots] if isinstance(roots, Path) else roots
+
+
+def _runs_under(root: Path, rules: Mapping[str, int]) -> list[Run]:
+    """Finished runs under a folder, by path."""
     runs = []
     for path in sorted(root.rglob("result.json")):
         result = read_result(path)
@@ -123,11 +139,9 @@ def find_runs(root: Path, rules: Mapping[str, int] | None = None) -> list[Run]:
             count = result.get("eval_episodes")
             episodes, zero = (_episodes(path.with_name(name), share, count) for name, share in shares.items())
             definition = (result.get("task_config") or {}).get("definition", NEUTRAL["definition"])
-            outdated = definition != (rules or {}).get(result["env"], definition)
+            outdated = definition != rules.get(result["env"], definition)
             runs.append(Run(path.parent, result, rows, trained, episodes, zero, outdated))
-    if not runs:
-        raise InputError(f"there is no finished run under {root}: point at a folder with result.json files in it.")
-    return _with_zero(_once(runs))
+    return runs
 
 
 def _once(runs: Sequence[Run]) -> list[Run]:

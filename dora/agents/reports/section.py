@@ -8,10 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from dora.agents.reports.run_results import Run, success_shares
-from dora.agents.reports.statistics import crossed_interval
+from dora.agents.reports.statistics import Interval, crossed_interval
 
 NONE = "-"
 """Cell of a table for which there is no run."""
+OVERLAP = "penetration_mm"
+"""Column of an episode's largest overlap [mm]."""
 NORMAL = 1.96
 """Half width of a normal distribution's 95 % interval, in standard deviations [1]."""
 
@@ -67,3 +69,9 @@ def error_of(runs: Sequence[Run]) -> float:
         return float("inf")
     low, high = crossed_interval(outcomes)
     return 100 * (high - low) / (2 * NORMAL)
+
+
+def with_interval(value: float, interval: Interval, sign: bool = False) -> str:
+    """A percentage and its interval, given as shares."""
+    form = "+.1f" if sign else ".1f"
+    return f"{100 * value:{form}} [{100 * interval[0]:{form}}, {100 * interval[1]:{form}}]"

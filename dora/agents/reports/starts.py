@@ -47,16 +47,20 @@ def joined(tables: Sequence[Episodes]) -> dict[str, Float[np.ndarray, " _"]]:
 
 
 def starts_section(runs: Sequence[Run]) -> Section:
-    """Success in each quarter of the episodes, in the order of each number that was drawn at their start."""
+    """Success in each quarter of the episodes, in the order of each number that was drawn at their start; of runs in
+    which no episode succeeds there is nothing to tell."""
     rows = []
     for (env, preset, agent, guidance, _), members in grouped(runs).items():
         episodes = joined([run.episodes for run in members])
-        for name in filter(_is_start, episodes):
+        for name in filter(_is_start, episodes if np.any(episodes.get("success", 0)) else ()):
             cells = [f"{100 * hits / n:.1f} ({low:.3g} to {high:.3g})" for low, high, n, hits in bins(episodes, name)]
             if cells:
                 rows.append([env, preset, agent, guidance, name.removeprefix(PREFIX), *cells])
     head = ("task", "preset", "learner", "guidance", "number", "lowest quarter", "second", "third", "highest quarter")
-    note = "Success % over the episodes of all seeds, and in brackets the number's range in that quarter."
+    note = (
+        "Success % over the episodes of all seeds, and in brackets the number's range in that quarter. Runs in which "
+        "no episode succeeds are left out."
+    )
     return Section("Success against how episodes began", head, rows, note)
 
 

@@ -60,6 +60,22 @@ def paired_difference(
     return float(ours.mean() - theirs.mean()), (float(low), float(high))
 
 
+def difference_of_pairs(
+    there: Float[np.ndarray, "seeds starts"], here: Float[np.ndarray, "seeds starts"]
+) -> tuple[float, Interval]:
+    """Mean difference of the same policies on the same starts, with its bootstrap interval over policies and starts,
+    which are drawn for both sides together.
+
+    Args:
+        there: outcomes of each policy for each start.
+        here: the same under what it is compared with.
+    """
+    difference = np.asarray(there - here, float)
+    found = difference.mean()
+    interval = (found, found) if np.ptp(difference) == 0 else crossed_interval(difference)
+    return float(found), (float(interval[0]), float(interval[1]))
+
+
 def mean_of_curve(curve: Sequence[Mapping[str, float]], budget: int) -> float | None:
     """Mean success over the steps of a run: the area under its evaluations, with straight lines between them, the first
     value before the first and the last after the last (runs that end early have reached what they wanted)."""
