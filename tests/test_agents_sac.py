@@ -1,14 +1,17 @@
 """Soft actor-critic: transitions over several steps, and what keeps a new actor at the prior."""
 
 import pickle
+from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.objectives import SoftUpdate
+from torchrl.objectives.utils import _vmap_func
 
 from dora.agents.config import SACConfig
 from dora.agents.learners.networks import TanhActor
-from dora.agents.learners.sac import SAC, multi_step
+from dora.agents.learners.sac import SAC, _leaves, multi_step
 from dora.agents.runs.recommended import recommended
 
 ROWS, LENGTH, OBSERVATION, ACTION = 4, 16, 3, 2
@@ -78,6 +81,33 @@ def test_actor_and_temperature_wait_for_the_critics():
     assert all(torch.equal(a, b) for a, b in zip(before, learner.actor_parameters, strict=True))
     assert "actor" in learner.update(batch())
     assert not all(torch.equal(a, b) for a, b in zip(before, learner.actor_parameters, strict=True))
+
+
+def test_a_gradient_step_is_that_of_torchrl_to_the_last_digit():
+    """The critics' values by their stacked parameters, and targets without tensordicts, change nothing."""
+    torch.manual_seed(0)
+    ours = SAC(
+        SACConfig(hidden=(8, 8), batch=16, warmup=0, critic_only=0, updates_per_step=0.5), OBSERVATION, ACTION, 0
+    )
+    torch.manual_seed(0)
+    theirs = SAC(ours.config, OBSERVATION, ACTION, 0)
+    net = theirs.loss.qvalue_network
+    plain: Any = _vmap_func(net, (None, 0), randomness="different", pseudo_vmap=True)
+    theirs.loss._vmap_qnetworkN0 = plain
+    theirs._follow = SoftUpdate(theirs.loss, tau=ours.config.polyak).step
+    data = [batch(done_share=0.1) for _ in range(3)]
+    for sac in (ours, theirs):
+        for seed, part in enumerate(data):
+            torch.manual_seed(seed)
+            sac.update(part.clone())
+    assert ours.updates == 96
+    states = [
+        {f"{n}/{k}": v for n, m in sac.modules.items() for k, v in m.state_dict().items()} for sac in (ours, theirs)
+    ]
+    moved = [name for name, value in states[0].items() if not torch.equal(value, states[1][name])]
+    assert moved == []
+    targets = _leaves(ours.loss.target_qvalue_network_params)
+    assert not any(torch.equal(*pair) for pair in zip(targets[-2:], ours.critic_parameters[-2:], strict=True))
 
 
 def test_values_are_discounted_mean_rewards():

@@ -1,10 +1,13 @@
 """A report tells what trained policies do under other physics, beside the runs that trained them."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import made_runs
 import numpy as np
 import pytest
+from made_runs import of
 
 from dora.agents.reports.physics import apart, physics_section
 from dora.agents.reports.report import write_report
@@ -18,15 +21,12 @@ LEARNER = {"gamma": 0.97}
 
 def made(folder: str, task: dict[str, Any] | None = None, won: str = "1100", **more: Any) -> Run:
     """A run whose episodes end as the digits say, with an overlap of .1 mm times the episode's number plus 1."""
-    success = np.array([float(digit) for digit in won])
-    result = {
-        "env": "DoraJug-v1", "agent": "sac", "guidance": "affordance", "preset": "standard", "seed": 10,
-        "env_steps": 1000, "total_steps": 1000, "wall_seconds": 60.0, "success_rate": float(success.mean()),
-        "zero_success_rate": None, "penetration_p95_mm": None, "eval_episodes": len(won), "first_seed": 5,
-        "task_config": TASK | (task or {}), "learner_config": LEARNER,
-    }  # fmt: skip
-    overlap = np.arange(1.0, len(won) + 1) / 10
-    return Run(Path(folder), result | more, [], {}, {"success": success, "penetration_mm": overlap})
+    episodes = of(*map(float, won)) | {"penetration_mm": np.arange(1.0, len(won) + 1) / 10}
+    numbers = {"task_config": TASK | (task or {}), "learner_config": LEARNER, "eval_episodes": len(won)}
+    rate = float(episodes["success"].mean())
+    return replace(
+        made_runs.made(rate=rate, episodes=episodes, **numbers | {"agent": "sac"} | more), folder=Path(folder)
+    )
 
 
 def again(folder: str, task: dict[str, Any], won: str = "1000", **more: Any) -> Run:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_report_sections import made, of, rows
+from made_runs import made, of, rows
 
 from dora.agents.reports.claims import Rates, above_the_best, claims
 from dora.agents.reports.paper import BETTER, ONE_ARM, PAPER, Cell
@@ -239,7 +239,8 @@ def test_columns_that_all_tables_have_are_joined_and_tables_without_starts_left_
 
 def test_success_in_quarters_is_that_of_a_row_of_the_table():
     episodes = of(1, 1, 1, 0, 0, 0, 0, 0) | {"start/size": np.arange(8.0)}
-    runs = [made(episodes=episodes), made(episodes=of(1), seed=11), made("none", episodes=of(0))]
+    nothing = of(*[0] * 8) | {"start/size": np.arange(8.0)}  # left out: there is nothing to tell
+    runs = [made(episodes=episodes), made(episodes=of(1), seed=11), made("none", episodes=nothing)]
     (row,) = starts_section(runs).rows
     assert row[:5] == ["DoraJug-v1", "standard", "PPO", "affordance", "size"]
     assert row[5:] == ["100.0 (0 to 1)", "50.0 (2 to 3)", "0.0 (4 to 5)", "0.0 (6 to 7)"]

@@ -1,43 +1,16 @@
 """Sections of a report against figures worked out by hand, from runs that are made up without files."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from made_runs import made, of, rows
 
-from dora.agents.reports.comparison import of_the_paper, sections
+from dora.agents.reports.comparison import of_the_paper
 from dora.agents.reports.failures import failure_kinds
 from dora.agents.reports.figures import draw_overlap
 from dora.agents.reports.paper import PAPER
-from dora.agents.reports.run_results import Run
 from dora.agents.reports.section import with_interval
-
-Rows = list[list[str]]
-
-
-def made(
-    guidance: str = "affordance", rate: float = 0.5, env: str = "DoraJug-v1", agent: str = "ppo", **more: Any
-) -> Run:
-    """A finished run; `curve`, `episodes`, `zero` and `outdated` are those of `Run`, all else of its result."""
-    own = {name: more.pop(name) for name in ("curve", "episodes", "zero", "outdated") if name in more}
-    result = {
-        "env": env, "agent": agent, "guidance": guidance, "preset": "standard", "seed": 10, "env_steps": 1000,
-        "total_steps": 1000, "wall_seconds": 600.0, "success_rate": rate, "zero_success_rate": None,
-        "penetration_p95_mm": None, "eval_episodes": 4, "first_seed": 5,
-    }  # fmt: skip
-    return Run(Path(f"{env}-{agent}-{guidance}"), result | more, own.pop("curve", []), **own)
-
-
-def rows(runs: list[Run], title: str) -> Rows:
-    """Those of the section whose title begins so; none where there is no such section."""
-    return next((section.rows for section in sections(runs) if section.title.startswith(title)), [])
-
-
-def of(*values: float) -> dict[str, np.ndarray]:
-    """Episodes that end so."""
-    return {"success": np.array(values, float)}
-
 
 # -------------------------------------------------------------- beside the paper
 
@@ -97,7 +70,7 @@ def test_minutes_stand_beside_those_that_the_paper_gives():
 
 
 def test_gains_need_both_and_their_means_over_training_every_curve():
-    curve = [{"env_steps": 500.0, "success_rate": 0.5}]
+    curve = [{"env_steps": 500.0, "wall_seconds": 60.0, "success_rate": 0.5}]
     guided = [made(rate=0.8, steps_to_80=steps, curve=curve) for steps in (2_500_000, 1_500_000, None)]
     plain = [made("none", 0.3, curve=[curve[0] | {"success_rate": 0.25}])]
     title = "What guidance gains"

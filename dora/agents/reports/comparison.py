@@ -1,12 +1,13 @@
 """Sections of a report that set runs beside each other and beside the paper: from their files alone."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from statistics import mean
 
 import numpy as np
 
 from dora.agents.reports.claims import above_the_best, claims
 from dora.agents.reports.failures import failure_kinds
+from dora.agents.reports.gains import gains, gains_of_regions, how_soon
 from dora.agents.reports.paper import DIFFERENCES, ONE_ARM, PAPER, Cell
 from dora.agents.reports.run_results import (
     DEFAULT_PRESET,
@@ -20,7 +21,7 @@ from dora.agents.reports.run_results import (
     zero_shares,
 )
 from dora.agents.reports.section import NONE, OVERLAP, Section, outcomes_of, rate_of, success_of, with_interval
-from dora.agents.reports.statistics import aggregates, crossed_interval, mean_of_curve, paired_difference
+from dora.agents.reports.statistics import aggregates, crossed_interval, paired_difference
 
 TOO_NARROW = (
     "Of a few seeds it is too narrow: of three that differ by 1 point (standard deviation) it covers the true mean in "
@@ -36,7 +37,8 @@ TOLD = (("reorient", "in_hand"), ("hand_action", "fingers"))
 def sections(runs: Sequence[Run]) -> list[Section]:
     """All tables for which there are runs."""
     cells = of_the_paper(runs)
-    made = [_differences(runs), _stages(runs), _overlap(runs), _failures(runs), _gains(cells)]
+    made = [_differences(runs), _stages(runs), _overlap(runs), _failures(runs), how_soon(runs)]
+    made += [gains(cells), gains_of_regions(runs)]
     if cells:
         made += [
             _success(cells),
@@ -146,37 +148,6 @@ def _minutes(cells: Mapping[Cell, list[Run]]) -> Section:
     return Section(
         "Minutes of a run beside the paper's table III", ("task", "learner", "guidance", "minutes", "paper"), rows, note
     )
-
-
-def _pairs(cells: Mapping[Cell, list[Run]]) -> Iterator[tuple[str, str, list[Run], list[Run]]]:
-    """Task, learner, guided and unguided runs, where there are both."""
-    for env, agent, guidance in PAPER:
-        if guidance == "affordance" and {(env, agent, guidance), (env, agent, "none")} <= set(cells):
-            yield env, agent, cells[env, agent, guidance], cells[env, agent, "none"]
-
-
-def _gains(cells: Mapping[Cell, list[Run]]) -> Section:
-    rows = []
-    for env, agent, guided, plain in _pairs(cells):
-        areas = [[a for r in runs if (a := mean_of_curve(r.curve, r.budget)) is not None] for runs in (guided, plain)]
-        area = f"{100 * (mean(areas[0]) - mean(areas[1])):+.1f}" if all(areas) else NONE
-        printed = PAPER[env, agent, "affordance"].success - PAPER[env, agent, "none"].success
-        final = rate_of(guided) - rate_of(plain)
-        rows.append([env, agent, f"{final:+.1f}", f"{printed:+.1f}", area, *(_steps(runs) for runs in (guided, plain))])
-    head = ("task", "learner", "gain", "gain in the paper", "gain of the mean over training",
-            "steps to 80 %, guided", "steps to 80 %, unguided")  # fmt: skip
-    note = (
-        "Guidance `affordance` less `none`, in points of success. The mean over training is the area under the "
-        "evaluations, of which the first stands for the time before it and the last for the rest of the budget."
-    )
-    return Section("What guidance gains", head, rows, note)
-
-
-def _steps(runs: Sequence[Run]) -> str:
-    """Steps to 80 % of the seeds that reached it."""
-    known = [run.result.get("steps_to_80") for run in runs]
-    reached = [steps for steps in known if steps is not None]
-    return f"{mean(reached) / 1000:.0f}k ({len(reached)} of {len(known)})" if reached else f"never (0 of {len(known)})"
 
 
 def _setup(cells: Mapping[Cell, list[Run]]) -> Section:

@@ -1,0 +1,117 @@
+"""What guidance gains, and how soon: final success, mean over training, steps and minutes to a share of successes."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from statistics import mean
+
+from dora.agents.reports.paper import PAPER, Cell
+from dora.agents.reports.run_results import SECONDS_PER_MINUTE, Group, Run, grouped, shared_mark
+from dora.agents.reports.section import NONE, Section, rate_of, success_of, with_interval
+from dora.agents.reports.statistics import mean_of_curve, paired_difference
+
+OF_CANDIDATES = ("optimised",)
+"""Switches of tasks that choose the candidates of `affordance`, in which these may differ from `grasps`."""
+IN_STEPS, IN_MINUTES = (0.5, 0.8), (0.5, 0.8, 0.9)
+"""Shares of successes in training's evaluations whose steps and whose minutes are told [1]."""
+
+
+def gains(cells: Mapping[Cell, list[Run]]) -> Section:
+    """Guidance `affordance` less `none`, in the cells of the paper's tables."""
+    rows = []
+    for env, agent, guided, plain in _pairs(cells):
+        printed = PAPER[env, agent, "affordance"].success - PAPER[env, agent, "none"].success
+        final = rate_of(guided) - rate_of(plain)
+        soon = (_steps(runs) for runs in (guided, plain))
+        rows.append([env, agent, f"{final:+.1f}", f"{printed:+.1f}", _gain_of_mean(guided, plain), *soon])
+    head = ("task", "learner", "gain", "gain in the paper", "gain of the mean over training",
+            "steps to 80 %, guided", "steps to 80 %, unguided")  # fmt: skip
+    note = (
+        "Guidance `affordance` less `none`, in points of success. The mean over training is the area under the "
+        "evaluations, of which the first stands for the time before it and the last for the rest of the budget."
+    )
+    return Section("What guidance gains", head, rows, note)
+
+
+def gains_of_regions(runs: Sequence[Run]) -> Section:
+    """Guidance `affordance` less `grasps`: the same motion and learner, candidates with and without regions."""
+    rows = []
+    for guided, plain, (env, preset, agent, guidance, _) in _same_but_regions(runs):
+        ours, theirs = success_of(guided), success_of(plain)
+        starts = {run.result.get("first_seed") for run in (*guided, *plain)}
+        final, verdict = f"{rate_of(guided) - rate_of(plain):+.1f}", NONE
+        if ours is not None and theirs is not None and ours.shape[1] == theirs.shape[1] and len(starts) == 1:
+            value, (low, high) = paired_difference(ours, theirs)
+            final = with_interval(value, (low, high), sign=True)
+            verdict = "helps" if low > 0 else "hurts" if high < 0 else "not told apart"
+        seeds = f"{len(guided)}, {len(plain)}"
+        soon = (_steps(some) for some in (guided, plain))
+        rows.append([env, preset, agent, guidance, seeds, final, verdict, _gain_of_mean(guided, plain), *soon])
+    head = ("task", "preset", "learner", "guidance", "seeds of each", "points more than with `grasps`", "regions",
+            "gain of the mean over training", "steps to 80 %", "steps to 80 % with `grasps`")  # fmt: skip
+    note = (
+        "The same reference motion, learner, budget and starts; the candidates of `grasps` are of a search without "
+        "regions, those 'made by hand' of none. In brackets the bootstrap interval over seeds and starts."
+    )
+    return Section("What regions gain: affordance less grasps", head, rows, note)
+
+
+def how_soon(runs: Sequence[Run]) -> Section:
+    """Steps and minutes at which an evaluation during training first reached some shares of successes."""
+    rows = []
+    for (env, preset, agent, guidance, _), members in grouped(runs).items():
+        if all(run.curve for run in members):
+            steps = [_reached(members, share, "env_steps", 1000, "k") for share in IN_STEPS]
+            minutes = [_reached(members, share, "wall_seconds", SECONDS_PER_MINUTE, "") for share in IN_MINUTES]
+            rows.append([env, preset, agent, guidance, *steps, *minutes, shared_mark(members).strip()])
+    head = ("task", "preset", "learner", "guidance", *(f"steps to {100 * share:.0f} %" for share in IN_STEPS),
+            *(f"minutes to {100 * share:.0f} %" for share in IN_MINUTES), "mark")  # fmt: skip
+    note = (
+        "Mean over the seeds that reached it, evaluations included; in brackets how many did, where not all. A run is "
+        "evaluated about every 25,000 steps, so nothing is reached sooner. Marks as in the table of all runs."
+    )
+    return Section("How soon: steps and minutes to a share of successes", head, rows, note)
+
+
+def _reached(runs: Sequence[Run], share: float, column: str, unit: float | int, after: str) -> str:
+    """Mean of a column of the learning curves in the first row with such a share of successes."""
+    first = [next((row[column] for row in run.curve if row["success_rate"] >= share), None) for run in runs]
+    known = [value / unit for value in first if value is not None]
+    count = "" if len(known) == len(runs) else f" ({len(known)} of {len(runs)})"
+    return f"{mean(known):.{0 if after else 1}f}{after}{count}" if known else "never"
+
+
+def _steps(runs: Sequence[Run]) -> str:
+    """Steps to 80 % of the seeds that reached it."""
+    known = [run.result.get("steps_to_80") for run in runs]
+    reached = [steps for steps in known if steps is not None]
+    return f"{mean(reached) / 1000:.0f}k ({len(reached)} of {len(known)})" if reached else f"never (0 of {len(known)})"
+
+
+def _gain_of_mean(guided: Sequence[Run], plain: Sequence[Run]) -> str:
+    """Difference of the areas under the evaluations of training."""
+    areas = [[a for r in runs if (a := mean_of_curve(r.curve, r.budget)) is not None] for runs in (guided, plain)]
+    return f"{100 * (mean(areas[0]) - mean(areas[1])):+.1f}" if all(areas) else NONE
+
+
+def _pairs(cells: Mapping[Cell, list[Run]]) -> Iterator[tuple[str, str, list[Run], list[Run]]]:
+    """Task, learner, guided and unguided runs, where there are both."""
+    for env, agent, guidance in PAPER:
+        if guidance == "affordance" and {(env, agent, guidance), (env, agent, "none")} <= set(cells):
+            yield env, agent, cells[env, agent, guidance], cells[env, agent, "none"]
+
+
+def _same_but_regions(runs: Sequence[Run]) -> Iterator[tuple[list[Run], list[Run], Group]]:
+    """Runs with `affordance` and those with `grasps` of the same task, learner, budget and settings, and the row of the
+    former."""
+    rows = grouped(runs)
+    for guided, members in rows.items():
+        for plain, others in rows.items():
+            same = guided[:3] == plain[:3] and guided[4] == plain[4]
+            whole = members[0].result["guidance"] == "affordance" and not members[0].result.get("guidance_parts")
+            if same and whole and others[0].result["guidance"] == "grasps" and _alike(members[0], others[0]):
+                yield members, others, guided
+
+
+def _alike(one: Run, other: Run) -> bool:
+    """Whether two runs have the same settings, of those that are known of both, whatever chooses the candidates."""
+    first, second = one.settings, other.settings
+    return all(first[name] == second[name] for name in first.keys() & second.keys() - set(OF_CANDIDATES))

@@ -1,0 +1,76 @@
+"""What a report says of guidance against the same motion without regions, and of how soon something is learned."""
+
+from typing import Any
+
+import pytest
+from made_runs import made, of, rows
+
+from dora.agents.reports.run_results import Run
+
+REGIONS, SOON = "What regions gain", "How soon"
+
+
+def pair(ours: str, theirs: str, **more: Any) -> list[Run]:
+    """A run with regions and one without, whose episodes end as the digits say."""
+    return [
+        made(guidance, sum(map(int, won)) / len(won), eval_episodes=len(won), episodes=of(*map(float, won)), **more)
+        for guidance, won in (("affordance", ours), ("grasps", theirs))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "points", "verdict"),
+    [
+        ("1" * 20, "0" * 20, "+100.0 [+100.0, +100.0]", "helps"),
+        ("0" * 20, "1" * 20, "-100.0 [-100.0, -100.0]", "hurts"),
+        ("1" * 20, "1" * 20, "+0.0 [+0.0, +0.0]", "not told apart"),
+        ("10" * 10, "01" * 10, "+0.0 [", "not told apart"),
+    ],
+)
+def test_regions_help_hurt_or_are_not_told_apart_from_the_same_motion_without(ours, theirs, points, verdict):
+    (row,) = rows(pair(ours, theirs), REGIONS)
+    assert row[:5] == ["DoraJug-v1", "standard", "PPO", "affordance", "1, 1"]
+    assert row[5].startswith(points)
+    assert row[6:] == [verdict, "-", "never (0 of 1)", "never (0 of 1)"]
+
+
+def test_their_means_over_training_and_steps_stand_beside_the_final_success():
+    curves = [[{"env_steps": 500.0, "wall_seconds": 60.0, "success_rate": share}] for share in (0.9, 0.6)]
+    guided = [made(rate=0.9, curve=curves[0], steps_to_80=500_000, seed=seed) for seed in (1, 2)]
+    plain = [made("grasps", 0.7, curve=curves[1])]
+    (row,) = rows([*guided, *plain], REGIONS)
+    assert row[4:] == ["2, 1", "+20.0", "-", "+30.0", "500k (2 of 2)", "never (0 of 1)"]
+
+
+def test_only_runs_of_the_same_settings_but_for_the_choice_of_candidates_are_compared():
+    guided, plain = pair("1100", "1000", task_config={"lift": 0.1, "optimised": False})
+    search = made(task_config={"lift": 0.1, "optimised": True}, episodes=of(1, 1, 1, 0), rate=0.75)
+    found = rows([guided, search, plain], REGIONS)
+    assert [(row[3], row[5].split()[0]) for row in found] == [
+        ("affordance, grasp made by hand", "+25.0"),
+        ("affordance, grasps of the search", "+50.0"),
+    ]
+    parts = made(guidance_parts=["reward"], episodes=of(1, 1, 1, 1))
+    others = [made(preset="hard"), made(agent="sac"), made(total_steps=9_000), made(env="DoraCube-v1"),
+              made(task_config={"lift": 0.2}), made("none"), parts]  # fmt: skip
+    assert rows([*others, plain], REGIONS) == []
+
+
+def test_other_starts_give_a_difference_without_a_verdict():
+    guided, plain = pair("1100", "1000")
+    (row,) = rows([guided, made("grasps", 0.25, first_seed=6, episodes=plain.episodes)], REGIONS)
+    assert row[5:7] == ["+25.0", "-"]
+
+
+def test_how_soon_is_the_mean_of_the_seeds_that_got_there():
+    def curve(*shares: float) -> list[dict[str, float]]:
+        return [
+            {"env_steps": 25_000.0 * k, "wall_seconds": 90.0 * k, "success_rate": share}
+            for k, share in enumerate(shares, 1)
+        ]
+
+    quick, slow = made(curve=curve(0.5, 0.9, 0.4)), made(curve=curve(0.2, 0.6, 0.85), seed=11, other_load=0.5)
+    (row,) = rows([quick, slow], SOON)
+    assert row == ["DoraJug-v1", "standard", "PPO", "affordance", "38k", "62k", "2.2", "3.8", "3.0 (1 of 2)", "†"]
+    assert rows([made(curve=curve(0.1))], SOON)[0][4:] == ["never"] * 5 + ["?"]
+    assert rows([quick, made(seed=12)], SOON) == []
