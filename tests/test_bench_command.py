@@ -13,6 +13,7 @@ from commands import call
 from dora.affordance.reach.approach_paths import OK
 from dora.commands import bench
 from dora.errors import InputError
+from dora.parallel import available_cores
 from dora.policies.policy import load_policy
 from dora.tools.filter_benchmark import Outcomes
 from dora.tools.physics_benchmark import Physics, PhysicsRow
@@ -37,11 +38,12 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
 
     for module in (bench.benchmark, bench.grasp_benchmark, bench.learner_benchmark, bench.page_rate):
         monkeypatch.setattr(module, "measure", noted)
+    monkeypatch.setattr(bench, "profile_training", noted)
     monkeypatch.setattr(bench.play, "find_players", lambda args: [args])
     return asked
 
 
-@pytest.mark.parametrize("words", ["env", "grasp", "learner --env DoraCube-v1", "page"])
+@pytest.mark.parametrize("words", ["env", "grasp", "learner --env DoraCube-v1", "page", "training"])
 def test_a_measurement_is_printed_as_a_table_or_as_an_object(
     words: str, asked: list[Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -51,6 +53,16 @@ def test_a_measurement_is_printed_as_a_table_or_as_an_object(
     assert call(bench, monkeypatch, *words.split(), "--json") == 0
     assert json.loads(capsys.readouterr().out) == {"steps_per_second": 1234.5, "note": "[idle]"}
     assert len(asked) == 2
+
+
+def test_a_training_is_profiled_with_the_recommended_settings(asked: list[Any]):
+    bench.bench_training("DoraHammer-v1", None, 60_000, json=True)
+    bench.bench_training("DoraHammer-v1", "ppo", json=True)
+    ((config, make_tasks, steps, cores), (other, *_)) = asked
+    assert (config.env, config.agent, other.agent, steps) == ("DoraHammer-v1", "sac", "ppo", 60_000)
+    assert cores == config.workers == available_cores()
+    assert make_tasks.args == ("DoraHammer-v1",)
+    assert make_tasks.keywords == config.task_options
 
 
 def test_a_learner_is_measured_with_the_sizes_of_the_task(asked: list[Any]):

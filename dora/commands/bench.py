@@ -1,6 +1,7 @@
 """Measure how fast the parts of Dora are: `dora bench env --env PickCube-v1 --json`."""
 
 import dataclasses
+import functools
 import json
 from math import isnan
 from typing import Literal, get_args
@@ -10,6 +11,7 @@ import tyro
 
 from dora.agents.learners import benchmark as learner_benchmark
 from dora.agents.runs.recommended import recommended
+from dora.agents.runs.training_profile import profile_training
 from dora.commands import play
 from dora.errors import InputError, command
 from dora.live import page_rate
@@ -79,6 +81,20 @@ def bench_learner(env: str = "DoraCube-v1", agent: str = "ppo", seconds: float =
     speed = learner_benchmark.measure(config, observation, task.action_size, seconds)
     task.close()
     report(dataclasses.asdict(speed), json)
+
+
+def bench_training(env: str = "DoraCube-v1", agent: str | None = None, steps: int = 50_000, json: bool = False) -> None:
+    """Where the time of a training goes, with a task's recommended settings: a short run, which is thrown away.
+
+    Args:
+        env: a Dora id.
+        agent: learner (default: the task's recommended one).
+        steps: environment steps; a run evaluates every 25,000 to 50,000 of them.
+        json: print one JSON object on the last line instead of a table.
+    """
+    config = recommended(env, agent, find_task(env).LEARNERS)
+    make_tasks = functools.partial(make_task, env, **config.task_options)
+    report(dataclasses.asdict(profile_training(config, make_tasks, steps, available_cores())), json)
 
 
 PHYSICS = ("120:10:8", "240:2:8", "240:3:6", "240:5:4", "240:5:8", "240:10:4", "240:10:8", "240:10:15", "480:10:8")
@@ -177,7 +193,7 @@ def report(result: dict, as_json: bool) -> None:
 
 KINDS = {
     "env": bench_env, "filter": bench_filter, "grasp": bench_grasp, "learner": bench_learner, "page": bench_page,
-    "physics": bench_physics,
+    "physics": bench_physics, "training": bench_training,
 }  # fmt: skip
 """What `dora bench NAME` does."""
 
