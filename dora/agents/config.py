@@ -136,14 +136,14 @@ NEUTRAL = {
     "definition": 1, "arm_effort": 1.0, "pose_filter": 1.0, "placed_after_overlap": 0.0, "reorient": "wrist",
     "observe_candidate": False, "hand_action": "joints", "overlap_range": 1.0,
     "hand_effort": 1.0, "wrist_speed": 1.0, "hand_speed": 1.0, "overlap_grace": 0.0,
-    "misplaced": "candidates", "history": 0,
+    "misplaced": "candidates", "history": 0, "observe_correction": False,
 }  # fmt: skip
 """Numbers of a task that settings of earlier versions lack, with the values at which they change nothing."""
 NOT_USUAL = {name: NEUTRAL[name] for name in ("pose_filter", "observe_candidate")}
 """Those of them whose usual value is another one, for some task or preset: stored settings without them mean these."""
 WITHOUT_EFFECT = {"turn": ("reorient", "wrist")}
 """The same of numbers that change nothing while another one has such a value."""
-OF_A_PART = {"observe_candidate": "observation"}
+OF_A_PART = {"observe_candidate": "observation", "observe_correction": "prior"}
 """The same of numbers that change nothing without this part of guidance."""
 UNUSED = {"reward": "dense", "after_success": None, "overlap_share": 1.0, "overlap_steps": 600_000}
 """The same of settings of the run."""

@@ -5,7 +5,8 @@
 Runs the same starts three times: with zero correction; with zero correction and candidates without an error, which is
 what is lost to everything but that error; and with the exact correction of that error as the action, within its bounds.
 A policy that learned cannot be expected above the second; if the third falls short of it, the bounds are too narrow; if
-a policy falls short of the third, it is the learner, or what the policy observes.
+a policy falls short of the third, it is the learner, or what the policy observes. These two are told apart by a policy
+that is trained with the exact correction in its observation: dora run --env DoraJug-v1 --task.observe-correction
 """
 
 import sys
@@ -19,12 +20,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dora.errors import InputError, command
-from dora.geometry.poses import relative
 from dora.progress import ProgressDisplay
 from dora.tables import share_text, text_table
 from dora.tasks import make_task
 from dora.tasks.env.env import DoraEnv
-from dora.tasks.guidance.exact_correction import exact_correction
 from dora.tools.episodes import play_out
 
 BATCH = 50
@@ -71,13 +70,7 @@ def no_action(task: DoraEnv) -> Float[Tensor, "n a"]:
 
 def exact_action(task: DoraEnv) -> Float[Tensor, "n a"]:
     """The exact correction of every arm, as far as the bounds allow."""
-    parts = []
-    for arm in task.arms.values():
-        bounds, expand = arm.guide.residual.bounds, arm.agent.wrist_controller.expand_hand
-        pose = task.objects[arm.spec.object].pose
-        frame = relative(task.perturbations.biased(arm.name, (pose.p, pose.q)), (pose.p, pose.q))
-        parts.append(exact_correction(arm.guide.choice, bounds, expand, arm.action_size - 6, frame))
-    return torch.cat(parts, -1)
+    return torch.cat(list(task.arms.exact_corrections(task.snapshot, task.perturbations).values()), -1)
 
 
 def outcome(args: Args, act: Act, error: float, report: Callable[[int, int], object]) -> Outcome:

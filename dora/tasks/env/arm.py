@@ -13,15 +13,20 @@ from dora.affordance.objects.catalogue import load_object
 from dora.affordance.reach.approach_paths import ReachSettings
 from dora.affordance.reach.feasibility import Reach
 from dora.affordance.reach.feasibility_table import Grid, ReachTable
+from dora.errors import InputError
 from dora.geometry.poses import Pose, compose
 from dora.progress import slow_phase
 from dora.robot.motion.controller_rollout import Controller
 from dora.sim.robot_agent import DescribedRobot
+from dora.tasks.guidance.exact_correction import exact_correction
 from dora.tasks.guidance.guide import Guide
 from dora.tasks.guidance.residual_action import Target, wrist_step
 from dora.tasks.mdp.guidance_parts import FILTER, PRIOR
 from dora.tasks.mdp.randomisation import Randomisation
 from dora.tasks.mdp.snapshot import Snapshot
+
+WRIST = 6
+"""Components of an action that move the wrist; the others bend the hand [1]."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +153,23 @@ class Arm:
         index = choice.nearest(object_p, object_q, wrist_p, wrist_q, wanted)
         choice.choose(rows, index, reachable.any(-1), error, randomisation)
         self.guide.begin(rows, wrist_p, wrist_q)
+
+    def exact_correction(self, frame: Pose | None = None) -> Float[Tensor, "n a"]:
+        """The residual action that undoes the error of its candidate, as far as the bounds allow.
+
+        Args:
+            frame: the true frame of its object in the measured one, position (n, 3) [m] and wxyz, if that is wrong.
+
+        Raises:
+            InputError: its actions are no residuals.
+        """
+        if not self.takes_residual:
+            raise InputError(
+                "A correction needs actions that correct a reference: leave control_mode and guidance_parts out, or "
+                "config.observe_correction."
+            )
+        expand, bounds = self.agent.wrist_controller.expand_hand, self.guide.residual.bounds
+        return exact_correction(self.guide.choice, bounds, expand, self.action_size - WRIST, frame)
 
     def command(self, observed: Snapshot, action: Float[Tensor, "n a"]) -> Float[Tensor, "n a"]:
         """What the controller is asked: the action itself, or the reference with the residual action.

@@ -11,8 +11,10 @@ from torch import Tensor
 
 from dora.arguments import as_tensor
 from dora.errors import InputError
+from dora.geometry.poses import relative
 from dora.sim.batch.actions import check_array
 from dora.tasks.env.arm import Arm
+from dora.tasks.env.perturbations import Perturbations
 from dora.tasks.guidance.candidate_choice import CandidateChoice
 from dora.tasks.mdp.observations import Entry, columns_by_arm
 from dora.tasks.mdp.snapshot import Snapshot
@@ -123,6 +125,20 @@ class ArmGroup(dict[str, Arm]):
             f"{arm.agent.uid}-{k}": command
             for k, (arm, command) in enumerate(zip(self.values(), commands, strict=True))
         }
+
+    def exact_corrections(self, s: Snapshot, perturbations: Perturbations) -> dict[str, Float[Tensor, "n a"]]:
+        """Of each arm the residual action that undoes the error of its candidate and of its object's measured pose.
+
+        Args:
+            s: the true state.
+            perturbations: of the episodes, which know the error of the pose.
+        """
+        found = {}
+        for name, arm in self.items():
+            body = s.objects[s.handles[name]]
+            pose = body.p, body.q
+            found[name] = arm.exact_correction(relative(perturbations.biased(name, pose), pose))
+        return found
 
     def scripted_action(self, observed: Snapshot) -> Float[Tensor, "n a"]:
         """Action that executes the chosen candidates from the present state."""

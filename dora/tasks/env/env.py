@@ -30,10 +30,10 @@ from dora.tasks.env.scene import TaskScene, film_camera, freeing_the_old_scene, 
 from dora.tasks.env.state import saved_state, set_rows, unflattened
 from dora.tasks.env.task import Task
 from dora.tasks.guidance.guide import Guide
-from dora.tasks.mdp.guidance_parts import FILTER
+from dora.tasks.mdp.guidance_parts import FILTER, PRIOR
 from dora.tasks.mdp.observations import joined, observation_table, observed_part
 from dora.tasks.mdp.rewards import Terms
-from dora.tasks.mdp.snapshot import Snapshot, advanced
+from dora.tasks.mdp.snapshot import Snapshot, advanced, corrected
 from dora.tasks.mdp.stages import Stages, make_stages
 
 
@@ -227,7 +227,10 @@ class DoraEnv(BaseEnv):
     def _read(self, step: Int[Tensor, " n"]) -> tuple[Snapshot, Snapshot]:
         """The true state and the observed one after so many control steps."""
         s = self.task.extended(self.task_scene.snapshot(self.machine, self.memory, step / self.task.MAX_STEPS))
-        return s, self.perturbations.observed(s, self.arms.choices, step)
+        observed = self.perturbations.observed(s, self.arms.choices, step)
+        if self.config.observe_correction and PRIOR in self.parts:
+            observed = corrected(observed, self.arms.exact_corrections(s, self.perturbations))
+        return s, observed
 
     # ------------------------------------------------------------------- reset
 
@@ -305,10 +308,7 @@ class DoraEnv(BaseEnv):
         return self.arms.out_of_reach & (FILTER in self.parts)
 
     def evaluate(self) -> dict[str, Tensor]:
-        """Success as the MDP says, failure, stages and overlap.
-
-        Idempotent: reset and wrappers call it too, so it moves nothing.
-        """
+        """Success as the MDP says, failure, stages and overlap; moves nothing, since reset and wrappers call it too."""
         s, memory, finished, unreachable = self.snapshot, self.memory, self.machine.finished, self.unreachable
         verdict = self.mdp.verdict(finished, unreachable, s, memory)
         return {**verdict, "unreachable": unreachable, **self.machine.report(), **memory.report()}

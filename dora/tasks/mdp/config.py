@@ -66,6 +66,9 @@ class TaskConfig:
     """What commands a hand: a number for each joint, or one for the bend of each finger and one for the thumb aside."""
     observe_candidate: bool = False
     """Whether the policy also observes where on the object the chosen candidate is; with guidance alone."""
+    observe_correction: bool = False
+    """Whether the policy also observes the exact correction of the candidate's error, which only the simulator knows:
+    for a diagnosis, not for use; with guidance alone."""
     history: int = 0
     """Earlier control steps whose observations and actions the policy sees besides the present ones."""
     residual: ResidualBounds = field(default_factory=ResidualBounds)

@@ -63,9 +63,11 @@ def observation_table(
         arms: names of the arms. With several, each arm has all entries, under `<arm>/<name>`, of what it sees.
         extra: the task's own entries beyond `ARM_ENTRIES` and `SHARED_ENTRIES`, of one arm.
         parts: parts of guidance in force; entries of other parts are left out.
-        config: numbers of the task; with `observe_candidate` there are `CANDIDATE_ENTRIES` besides.
+        config: numbers of the task; with `observe_candidate` there are `CANDIDATE_ENTRIES` besides, with
+            `observe_correction` `CORRECTION_ENTRIES`.
     """
     table = {**ARM_ENTRIES, **extra, **(CANDIDATE_ENTRIES if config.observe_candidate else {})}
+    table |= CORRECTION_ENTRIES if config.observe_correction else {}
     if len(arms) > 1:
         own = {
             f"{arm}/{name}": replace(entry, value=_as_observed_by(arm, entry))
@@ -196,5 +198,11 @@ CANDIDATE_ENTRIES = {
 }
 """What every arm observes besides with the task's number `observe_candidate`. It is the same in the whole episode, and
 free of noise: the pose of the object and the goal that follows from it are measured with the same error."""
+CORRECTION_ENTRIES = {
+    "correction": Entry(
+        lambda s: s.goal.correction, "1", "residual that undoes the candidate's error, exactly", True, True
+    )
+}
+"""What every arm observes besides with the task's number `observe_correction`: no sensor could tell it."""
 SHARED_ENTRIES = ("max_penetration", "stage", "time")
 """Those of them that are the same for all arms of a task."""

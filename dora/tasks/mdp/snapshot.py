@@ -93,6 +93,8 @@ class GoalState:
         nearest_p, nearest_q: the same wrist poses for the nearest reachable candidates, the chosen one first.
         phase: the reference's phase, one-hot.
         residual: low-passed residual action, in units of its bounds.
+        correction: the residual that undoes the error of the chosen candidate, in units of its bounds; None unless it
+            is observed.
     """
 
     p: Float[Tensor, "n 3"]
@@ -104,6 +106,7 @@ class GoalState:
     nearest_q: Float[Tensor, "n k 4"]
     phase: Float[Tensor, "n phases"]
     residual: Float[Tensor, "n a"]
+    correction: Float[Tensor, "n a"] | None = None
 
 
 Record = TypeVar("Record")
@@ -230,6 +233,12 @@ def advanced(s: S, stage: Tensor, stages: Mapping[str, Tensor], phases: Mapping[
     """The snapshot with other stages and other phases of the references (by arm); what was derived stays."""
     goals = {arm: replace(goal, phase=phases[arm]) for arm, goal in s.goals.items()}
     return _sharing(s, replace(s, stage=stage, stages=stages, goals=goals), DERIVED, FROM_CONTACTS)
+
+
+def corrected(s: S, corrections: Mapping[str, Tensor]) -> S:
+    """The snapshot with the exact correction of each arm's candidate, (n, a) by arm; what was derived stays."""
+    goals = {arm: replace(goal, correction=corrections[arm]) for arm, goal in s.goals.items()}
+    return _sharing(s, replace(s, goals=goals), DERIVED, FROM_CONTACTS)
 
 
 def observed(
