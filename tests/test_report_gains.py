@@ -21,13 +21,13 @@ def pair(ours: str, theirs: str, **more: Any) -> list[Run]:
 @pytest.mark.parametrize(
     ("ours", "theirs", "points", "verdict"),
     [
-        ("1" * 20, "0" * 20, "+100.0 [+100.0, +100.0]", "helps"),
-        ("0" * 20, "1" * 20, "-100.0 [-100.0, -100.0]", "hurts"),
+        ("1" * 20, "0" * 20, "+100.0 [+100.0, +100.0]", "more"),
+        ("0" * 20, "1" * 20, "-100.0 [-100.0, -100.0]", "less"),
         ("1" * 20, "1" * 20, "+0.0 [+0.0, +0.0]", "not told apart"),
         ("10" * 10, "01" * 10, "+0.0 [", "not told apart"),
     ],
 )
-def test_regions_help_hurt_or_are_not_told_apart_from_the_same_motion_without(ours, theirs, points, verdict):
+def test_success_with_regions_is_more_or_less_than_without_or_not_told_apart(ours, theirs, points, verdict):
     (row,) = rows(pair(ours, theirs), REGIONS)
     assert row[:5] == ["DoraJug-v1", "standard", "PPO", "affordance", "1, 1"]
     assert row[5].startswith(points)

@@ -41,15 +41,16 @@ def gains_of_regions(runs: Sequence[Run]) -> Section:
         if ours is not None and theirs is not None and ours.shape[1] == theirs.shape[1] and len(starts) == 1:
             value, (low, high) = paired_difference(ours, theirs)
             final = with_interval(value, (low, high), sign=True)
-            verdict = "helps" if low > 0 else "hurts" if high < 0 else "not told apart"
+            verdict = "more" if low > 0 else "less" if high < 0 else "not told apart"
         seeds = f"{len(guided)}, {len(plain)}"
         soon = (_steps(some) for some in (guided, plain))
         rows.append([env, preset, agent, guidance, seeds, final, verdict, _gain_of_mean(guided, plain), *soon])
-    head = ("task", "preset", "learner", "guidance", "seeds of each", "points more than with `grasps`", "regions",
+    head = ("task", "preset", "learner", "guidance", "seeds of each", "points more than with `grasps`", "verdict",
             "gain of the mean over training", "steps to 80 %", "steps to 80 % with `grasps`")  # fmt: skip
     note = (
         "The same reference motion, learner, budget and starts; the candidates of `grasps` are of a search without "
-        "regions, those 'made by hand' of none. In brackets the bootstrap interval over seeds and starts."
+        "regions. (A grasp made by hand is of no search: its row does not tell what regions gain.) In brackets the "
+        "bootstrap interval over seeds and starts."
     )
     return Section("What regions gain: affordance less grasps", head, rows, note)
 
@@ -65,8 +66,8 @@ def how_soon(runs: Sequence[Run]) -> Section:
     head = ("task", "preset", "learner", "guidance", *(f"steps to {100 * share:.0f} %" for share in IN_STEPS),
             *(f"minutes to {100 * share:.0f} %" for share in IN_MINUTES), "mark")  # fmt: skip
     note = (
-        "Mean over the seeds that reached it, evaluations included; in brackets how many did, where not all. A run is "
-        "evaluated about every 25,000 steps, so nothing is reached sooner. Marks as in the table of all runs."
+        "Mean over the seeds that reached it, evaluations included; in brackets how many did, where not all. Nothing is "
+        "reached before the first evaluation, which a task's settings have after 40,000 to 150,000 steps. Marks as in the table of all runs."
     )
     return Section("How soon: steps and minutes to a share of successes", head, rows, note)
 
