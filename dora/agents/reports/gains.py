@@ -66,8 +66,9 @@ def how_soon(runs: Sequence[Run]) -> Section:
     head = ("task", "preset", "learner", "guidance", *(f"steps to {100 * share:.0f} %" for share in IN_STEPS),
             *(f"minutes to {100 * share:.0f} %" for share in IN_MINUTES), "mark")  # fmt: skip
     note = (
-        "Mean over the seeds that reached it, evaluations included; in brackets how many did, where not all. Nothing is "
-        "reached before the first evaluation, which a task's settings have after 40,000 to 150,000 steps. Marks as in the table of all runs."
+        "Mean over the seeds that reached it, evaluations included; in brackets how many did, where not all. Nothing "
+        "is reached before the first evaluation, which a task's settings have after 40,000 to 150,000 steps. Marks as "
+        "in the table of all runs."
     )
     return Section("How soon: steps and minutes to a share of successes", head, rows, note)
 
