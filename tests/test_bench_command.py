@@ -58,7 +58,7 @@ def test_a_measurement_is_printed_as_a_table_or_as_an_object(
 def test_a_training_is_profiled_with_the_recommended_settings(asked: list[Any]):
     bench.bench_training("DoraHammer-v1", None, 60_000, json=True)
     bench.bench_training("DoraHammer-v1", "ppo", json=True)
-    ((config, make_tasks, steps, cores), (other, *_)) = asked
+    ((config, make_tasks, _, steps, cores), (other, *_)) = asked
     assert (config.env, config.agent, other.agent, steps) == ("DoraHammer-v1", "sac", "ppo", 60_000)
     assert cores == config.workers == available_cores()
     assert make_tasks.args == ("DoraHammer-v1",)

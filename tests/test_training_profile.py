@@ -10,10 +10,10 @@ import pytest
 from fake_task import PointMass
 from short_runs import BASE, SMALL_PPO
 
-from dora.agents.counters import Counters
 from dora.agents.runs import training_profile
 from dora.agents.runs.training_profile import EVERY, ClockedTasks, Clocks, profile_training
 from dora.errors import InputError
+from dora.sim import StepProfile
 
 
 class Simulated(PointMass):
@@ -53,7 +53,7 @@ def now(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 
 def test_a_tasks_clocks_run_from_its_first_step_on(now: SimpleNamespace, tmp_path: Path):
-    task = ClockedTasks(lambda count: Slow(now), tmp_path)(4)  # pyright: ignore[reportArgumentType]
+    task = ClockedTasks(lambda count: Slow(now), tmp_path, StepProfile)(4)  # pyright: ignore[reportArgumentType]
     assert task.reset() == "first"
     now.used += 50  # before training
     for _ in range(EVERY):
@@ -74,9 +74,9 @@ def test_a_tasks_clocks_run_from_its_first_step_on(now: SimpleNamespace, tmp_pat
 
 
 def test_shares_are_of_the_main_process_and_of_all_workers():
-    counters = Counters(seconds={"collect": 10.0, "learn": 5.0, "evaluate": 4.0}, env_steps=4000)
+    spent = {"collect": 10.0, "learn": 5.0, "evaluate": 4.0}
     moments, clocks = ((10.0, 3.0), (30.0, 37.0)), [Clocks(4.0, 2.0, 8.0, 1.0), Clocks(6.0, 2.0, 12.0, 3.0)]
-    found = training_profile._summed(replace(BASE, workers=2), counters, moments, clocks, 2)
+    found = training_profile._summed(replace(BASE, workers=2), 4000, spent, moments, clocks, 2)
     assert (found.env, found.agent, found.steps) == ("Fake-v1", "ppo", 4000)
     assert (found.seconds, found.steps_per_second, found.busy_cores, found.cores) == (20.0, 200.0, 1.7, 2)
     assert (found.collecting, found.learning, found.evaluating) == (0.5, 0.25, 0.2)
@@ -87,12 +87,12 @@ def test_shares_are_of_the_main_process_and_of_all_workers():
 
 def test_a_short_run_is_profiled_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(training_profile.tempfile, "tempdir", str(tmp_path))
-    config = replace(BASE, workers=1, eval_every=512, learner=SMALL_PPO)
-    found = profile_training(config, Simulated, 1024, 2)
+    config = replace(BASE, workers=1, eval_every=512, eval_envs=2, learner=SMALL_PPO)
+    found = profile_training(config, Simulated, StepProfile, 1024, 2)
     assert (found.env, found.agent, found.steps) == ("Fake-v1", "ppo", 1024)
     main = found.collecting, found.learning, found.evaluating, found.saving
     assert sum(main) == pytest.approx(1.0)
-    assert min(main) > 0
+    assert min(main) > 0  # the time of the last evaluation, which is as long as the training, is left out
     assert 0 < found.environment < 1
     assert 0 < found.acting < 1
     assert found.busy_cores > 0
@@ -103,4 +103,4 @@ def test_a_short_run_is_profiled_and_leaves_nothing(tmp_path: Path, monkeypatch:
 def test_too_few_and_too_many_steps_are_refused(steps: int):
     config = replace(BASE, workers=1, learner=SMALL_PPO)
     with pytest.raises(InputError, match=f"--steps is {steps}: give a number from 512"):
-        profile_training(config, PointMass, steps, 2)
+        profile_training(config, PointMass, StepProfile, steps, 2)

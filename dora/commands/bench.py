@@ -19,6 +19,7 @@ from dora.parallel import available_cores
 from dora.policies.policy import load_policy
 from dora.progress import ProgressDisplay
 from dora.robot import load_robot
+from dora.sim import StepProfile
 from dora.tables import print_table
 from dora.tasks import check_task_id, find_task, make_task
 from dora.tools import env_benchmark as benchmark
@@ -94,7 +95,7 @@ def bench_training(env: str = "DoraCube-v1", agent: str | None = None, steps: in
     """
     config = recommended(env, agent, find_task(env).LEARNERS)
     make_tasks = functools.partial(make_task, env, **config.task_options)
-    report(dataclasses.asdict(profile_training(config, make_tasks, steps, available_cores())), json)
+    report(dataclasses.asdict(profile_training(config, make_tasks, StepProfile, steps, available_cores())), json)
 
 
 PHYSICS = ("120:10:8", "240:2:8", "240:3:6", "240:5:4", "240:5:8", "240:10:4", "240:10:8", "240:10:15", "480:10:8")

@@ -4,7 +4,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,12 @@ from typing import Any
 from dora.agents.collecting.rollouts import Rollouts
 from dora.agents.collecting.task_env import MakeTask
 from dora.agents.config import RunConfig
-from dora.agents.counters import Counters
 from dora.agents.evaluation.evaluate import Evaluation
 from dora.agents.runs.interrupt import Interrupt
 from dora.agents.runs.machine import own_seconds
 from dora.agents.runs.run_folder import RunFolder
 from dora.agents.runs.trainer import Trainer
 from dora.errors import InputError
-from dora.sim import StepProfile
 
 MOST_STEPS = 10_000_000
 """Most environment steps of a profile [1]."""
@@ -83,23 +81,24 @@ class ClockedTasks:
     Args:
         make_task: makes a batch of tasks from their number; picklable.
         folder: of the files, one for each task.
+        make_profile: makes what a task's simulator adds its times to: by part, `seconds["physics"]` among them.
     """
 
-    def __init__(self, make_task: MakeTask, folder: Path):
-        self.make_task, self.folder = make_task, folder
+    def __init__(self, make_task: MakeTask, folder: Path, make_profile: Callable[[], Any]):
+        self.make_task, self.folder, self.make_profile = make_task, folder, make_profile
 
     def __call__(self, count: int) -> Any:
         """A batch of so many tasks, whose steps and resets are timed."""
         task = self.make_task(count)
-        _Clock(task, self.folder / f"{os.getpid()}-{id(task)}.json")
+        _Clock(task, self.folder / f"{os.getpid()}-{id(task)}.json", self.make_profile())
         return task
 
 
 class _Clock:
     """Times what a task does from its first step on; arguments as its name says."""
 
-    def __init__(self, task: Any, path: Path):
-        self._task, self._path, self._profile = task, path, StepProfile()
+    def __init__(self, task: Any, path: Path, profile: Any):
+        self._task, self._path, self._profile = task, path, profile
         self._environment = self._inside = self._acting = 0.0
         self._left, self._steps = 0.0, 0
         task.step, task.reset = self._timed(task.step, is_step=True), self._timed(task.reset, is_step=False)
@@ -136,12 +135,15 @@ class _Clock:
         half.replace(self._path)
 
 
-def profile_training(config: RunConfig, make_task: MakeTask, steps: int, cores: int) -> TrainingProfile:
+def profile_training(
+    config: RunConfig, make_task: MakeTask, make_profile: Callable[[], Any], steps: int, cores: int
+) -> TrainingProfile:
     """Train for a while and tell where the time went; the run is thrown away.
 
     Args:
         config: settings of the run, with workers.
         make_task: makes a batch of its tasks from their number; picklable.
+        make_profile: as for `ClockedTasks`.
         steps: environment steps; evaluations come as often as the settings say.
         cores: of the machine.
 
@@ -157,28 +159,29 @@ def profile_training(config: RunConfig, make_task: MakeTask, steps: int, cores: 
         clocks.mkdir()
         folder.create(config)
         trainer = _Timed(config, make_task, folder, zero=False)
-        trainer.clocks = clocks
+        trainer.clocked = ClockedTasks(make_task, clocks, make_profile)
         trainer.run()
         if trainer.interrupted is not None:
             raise KeyboardInterrupt
         found = [Clocks(**json.loads(path.read_text())) for path in sorted(clocks.glob("*.json"))]
-    return _summed(config, trainer.counters, (trainer.begun, trainer.ended), found, cores)
+    return _summed(config, trainer.counters.env_steps, trainer.spent, (trainer.begun, trainer.ended), found, cores)
 
 
 class _Timed(Trainer):
     """A run that notes when its training began and ended, with tasks of workers that have clocks."""
 
-    clocks: Path
-    """Folder for those."""
+    clocked: ClockedTasks
+    """Makes those."""
 
     def _rollouts(self, interrupt: Interrupt) -> Rollouts:
-        self.make_task = ClockedTasks(self.make_task, self.clocks)  # evaluation has its tasks already
+        self.make_task = self.clocked  # evaluation has its own already
         rollouts = super()._rollouts(interrupt)
         self.begun = time.perf_counter(), own_seconds()
         return rollouts
 
     def _final_evaluation(self, interrupt: Interrupt) -> tuple[Evaluation, Evaluation | None]:
         self.ended = time.perf_counter(), own_seconds()
+        self.spent = dict(self.counters.seconds)  # before the last evaluation's time is added
         return super()._final_evaluation(interrupt)
 
 
@@ -187,12 +190,17 @@ Moment = tuple[float, float]
 
 
 def _summed(
-    config: RunConfig, counters: Counters, between: tuple[Moment, Moment], clocks: Sequence[Clocks], cores: int
+    config: RunConfig,
+    steps: int,
+    spent: Mapping[str, float],
+    between: tuple[Moment, Moment],
+    clocks: Sequence[Clocks],
+    cores: int,
 ) -> TrainingProfile:
     """The profile of a run from its own clocks and those of its workers."""
     (begun, used), (ended, used_then) = between
     seconds = ended - begun
-    phases = {name: spent / seconds for name, spent in counters.seconds.items()}
+    phases = {name: time_of / seconds for name, time_of in spent.items()}
     of_workers = {
         name: sum(getattr(each, name) for each in clocks) / (seconds * config.workers)
         for name in ("physics", "contacts", "environment", "acting")
@@ -201,9 +209,9 @@ def _summed(
     return TrainingProfile(
         env=config.env,
         agent=config.agent,
-        steps=counters.env_steps,
+        steps=steps,
         seconds=seconds,
-        steps_per_second=counters.env_steps / seconds,
+        steps_per_second=steps / seconds,
         cores=cores,
         busy_cores=(used_then - used) / seconds,
         collecting=phases["collect"],
