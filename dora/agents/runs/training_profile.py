@@ -95,7 +95,13 @@ class ClockedTasks:
 
 
 class _Clock:
-    """Times what a task does from its first step on; arguments as its name says."""
+    """Times what a task does from its first step on, and writes its `Clocks`.
+
+    Args:
+        task: whose `step` and `reset` are timed from now on.
+        path: of the file.
+        profile: what its simulator adds its times to, as of `ClockedTasks`.
+    """
 
     def __init__(self, task: Any, path: Path, profile: Any):
         self._task, self._path, self._profile = task, path, profile
@@ -104,11 +110,14 @@ class _Clock:
         task.step, task.reset = self._timed(task.step, is_step=True), self._timed(task.reset, is_step=False)
 
     def _timed(self, method: Callable[..., Any], is_step: bool) -> Callable[..., Any]:
+        """The method with clocks around it; a reset before the first step is not timed."""
+
         def call(*args: Any, **kwargs: Any) -> Any:
+            """As the method, whose times are added [s]."""
             entered, at = time.process_time(), time.perf_counter()
             if self._steps:
                 self._acting += entered - self._left
-            if not (is_step or self._steps):  # the first episodes begin: the clocks do not run yet
+            if not (is_step or self._steps):
                 return method(*args, **kwargs)
             if is_step and self._task.scene.px.profile is not self._profile:  # that of a scene that was built anew
                 self._task.scene.px.profile = self._profile
@@ -126,7 +135,7 @@ class _Clock:
 
     def _write(self) -> None:
         """Parts of the simulator are wall times; they are taken as shares of the processor time inside."""
-        share = self._environment / max(self._inside, 1e-9)
+        share = self._environment / self._inside
         parts = {name: share * seconds for name, seconds in self._profile.seconds.items()}
         physics = parts.pop("physics")
         clocks = Clocks(physics, sum(parts.values()), self._environment, self._acting)
