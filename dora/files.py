@@ -123,6 +123,18 @@ def make_folder(folder: Path) -> None:
         raise InputError(f"Cannot make the folder {folder} ({error}): choose another one.") from error
 
 
+def files_under(folder: Path, name: str) -> list[Path]:
+    """Files of a name in a folder and those below it, behind links too, each once; sorted by path."""
+    found, seen = list[Path](), set[str]()
+    for path, below, names in os.walk(folder, followlinks=True):
+        real = os.path.realpath(path)
+        below[:] = [] if real in seen else sorted(below)
+        if real not in seen and name in names:
+            found.append(Path(path, name))
+        seen.add(real)
+    return sorted(found)
+
+
 def check_name(path: Path) -> None:
     """Refuse a path that libraries which write there cannot take.
 

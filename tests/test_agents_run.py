@@ -275,6 +275,8 @@ def test_a_seed_chooses_the_starts_of_an_evaluation(
     assert (results["a"]["seed"], results["a"]["first_seed"]) == (3, first_seed(3, 5))
     assert os.environ[RECORDS] == str(tmp_path / "c" / "nonfinite")  # where an evaluation puts its last states
     assert results["a"]["checkpoint"] == str(tmp_path / "run" / "checkpoints" / "best.safetensors")
+    assert (trained["seed"], results["a"]["policy_seed"]) == (0, 0)  # of the policy, not of the starts
+    assert {result["policy_digest"] for result in (trained, *results.values())} == {trained["policy_digest"]}
 
 
 @pytest.mark.usefixtures("point_mass")

@@ -72,7 +72,7 @@ def test_runs_of_earlier_rules_of_a_task_stand_apart(tmp_path: Path):
 
 
 def test_runs_of_tasks_with_other_numbers_are_not_averaged(tmp_path: Path):
-    """Named by the switch where it tells them apart, else by all that differs."""
+    """All that differs is named: rows that differ in more than a switch are not to look like variants of one task."""
     numbers = [
         {"optimised": False, "weights": {"lift": 3.0}, "same": 1},
         {"optimised": False, "weights": {"lift": 3.0}, "same": 1},
@@ -84,7 +84,7 @@ def test_runs_of_tasks_with_other_numbers_are_not_averaged(tmp_path: Path):
         path.write_text(json.dumps(json.loads(path.read_text()) | {"task_config": each}))
     rows = tables(find_runs(tmp_path)).splitlines()[2:]
     assert [row.split(" | ")[3:5] for row in rows] == [
-        ["affordance, grasp made by hand", "2"], ["affordance, grasps of the search", "1"],
+        ["affordance, grasp made by hand", "2"], ["affordance, grasps of the search, weights.lift 2.0", "1"],
     ]  # fmt: skip
     path = tmp_path / "1" / "result.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"task_config": numbers[0] | {"weights": {"lift": 1.0}}}))
@@ -187,6 +187,15 @@ def test_a_report_has_a_table_a_page_and_a_figure(tmp_path: Path):
     assert "Toy-v1.png" in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_no_figure_takes_the_place_of_another(tmp_path: Path):
+    """Toy with the preset hard and the task Toy-hard would have the same name."""
+    write_run(tmp_path / "runs" / "a", 0, 0.9, preset="hard")
+    write_run(tmp_path / "runs" / "b", 0, 0.5, env="Toy-v1-hard")
+    names = [path.name for path in write_report(tmp_path / "runs", tmp_path / "out") if path.suffix == ".png"]
+    assert len(set(names)) == 2
+    assert all(name.startswith("Toy-v1-hard") for name in names)
+
+
 def test_names_from_files_are_text_in_a_report(tmp_path: Path):
     name = '<script>alert("$1|2")</script>'
     write_run(tmp_path / "runs" / "a", 0, 0.9, env=name)
@@ -208,7 +217,13 @@ def test_no_runs_and_damaged_ones_are_refused(tmp_path: Path):
         find_runs(tmp_path)
 
 
-@pytest.mark.parametrize("entry", [{"learner_config": [1]}, {"task_config": "x"}, {"seed": [1]}, {"config_digest": {}}])
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"learner_config": [1]}, {"task_config": "x"}, {"seed": [1]}, {"config_digest": {}}, {"num_envs": {}},
+        {"workers": "2"}, {"policy_seed": -1}, {"policy_digest": 1},
+    ],
+)  # fmt: skip
 def test_an_entry_of_another_type_is_named(tmp_path: Path, entry: dict[str, object]):
     for name in ("a", "b"):
         write_run(tmp_path / name, 0, 0.5)

@@ -10,11 +10,13 @@ from dora.agents.reports.run_results import Run
 REGIONS, SOON = "What regions gain", "How soon"
 
 
-def pair(ours: str, theirs: str, **more: Any) -> list[Run]:
-    """A run with regions and one without, whose episodes end as the digits say."""
+def pair(ours: str, theirs: str, seeds: int = 1, **more: Any) -> list[Run]:
+    """Runs with regions, then as many without, whose episodes end as the digits say."""
+    more |= {"eval_episodes": len(ours)}
     return [
-        made(guidance, sum(map(int, won)) / len(won), eval_episodes=len(won), episodes=of(*map(float, won)), **more)
+        made(guidance, sum(map(int, won)) / len(won), episodes=of(*map(float, won)), seed=10 + seed, **more)
         for guidance, won in (("affordance", ours), ("grasps", theirs))
+        for seed in range(seeds)
     ]
 
 
@@ -28,10 +30,24 @@ def pair(ours: str, theirs: str, **more: Any) -> list[Run]:
     ],
 )
 def test_success_with_regions_is_more_or_less_than_without_or_not_told_apart(ours, theirs, points, verdict):
-    (row,) = rows(pair(ours, theirs), REGIONS)
-    assert row[:5] == ["DoraJug-v1", "standard", "PPO", "affordance", "1, 1"]
+    (row,) = rows(pair(ours, theirs, seeds=3), REGIONS)
+    assert row[:5] == ["DoraJug-v1", "standard", "PPO", "affordance", "3, 3"]
     assert row[5].startswith(points)
-    assert row[6:] == [verdict, "-", "never (0 of 1)", "never (0 of 1)"]
+    assert row[6:] == [verdict, "-", "-", "-"]
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(3, 2), (2, 3), (1, 1)])
+def test_few_seeds_give_no_verdict(ours, theirs):
+    guided, plain = pair("1" * 20, "0" * 20, seeds=ours)[:ours], pair("1" * 20, "0" * 20, seeds=theirs)[theirs:]
+    (row,) = rows([*guided, *plain], REGIONS)
+    assert row[5:7] == ["+100.0 [+100.0, +100.0]", f"too few runs: {min(ours, theirs)} of 3 seeds"]
+
+
+def test_steps_to_a_share_are_read_from_the_curve_where_the_result_lacks_them():
+    curve = [{"env_steps": 1000.0 * k, "wall_seconds": 60.0 * k, "success_rate": k / 5} for k in range(1, 6)]
+    guided, plain = pair("1100", "1000", curve=curve)
+    (row,) = rows([guided, plain, made(seed=11, steps_to_80=6000)], REGIONS)
+    assert row[8:] == ["5k (2 of 2)", "4k (1 of 1)"]
 
 
 def test_their_means_over_training_and_steps_stand_beside_the_final_success():

@@ -83,10 +83,11 @@ def test_of_several_runs_the_one_with_the_policys_settings_is_taken():
         again("b", {}),
         again("b", {"definition": 2, "physics_frequency": 200}),
         again("b", FINER, seed=11),
+        again("b", FINER, policy_seed=11),
         made("b", FINER),
         again("b", FINER, task_config=None),
     ],
-    ids=["same physics", "other rules", "other seed", "a training", "unknown"],
+    ids=["same physics", "other rules", "other seed", "other policy", "a training", "unknown"],
 )
 def test_what_is_no_such_evaluation_stays_a_row_of_its_own(other: Run):
     runs = [made("a"), other]
@@ -95,9 +96,28 @@ def test_what_is_no_such_evaluation_stays_a_row_of_its_own(other: Run):
 
 def test_other_starts_are_no_pairs():
     trained = made("a", won="1111")
-    assert cells(trained, again("b", FINER, "1000", first_seed=6))[0][8] == "-75.0"
-    assert cells(trained, again("b", FINER, "10"))[0][8] == "-50.0"
+    assert cells(trained, again("b", FINER, "1000", first_seed=6, policy_seed=10))[0][8] == "-75.0"
+    assert cells(made("a", won="1000"), again("b", FINER, "11"))[0][6:9] == ["25.0", "100.0", "+50.0 [+0.0, +100.0]"]
     assert cells(trained, again("b", FINER, "1111"))[0][8] == "+0.0 [+0.0, +0.0]"
+
+
+def test_the_run_that_trained_a_policy_is_told_by_its_file_else_by_its_seed():
+    """The seed of an evaluation is that of its starts, if one was given."""
+    trained = [
+        made(f"t{seed}", won=won, seed=seed, policy_digest=f"of {seed}") for seed, won in ((10, "1111"), (11, "1000"))
+    ]
+    of_ten = {"policy_seed": 10, "seed": 11, "first_seed": 6}
+    assert cells(*trained, again("b", FINER, **of_ten, policy_digest="of 10"))[0][6] == "100.0"
+    assert cells(*trained, again("b", FINER, **of_ten))[0][6] == "100.0"
+    assert cells(*trained, again("b", FINER, **of_ten, policy_digest="of another run of seed 10")) == []
+    assert cells(*trained, again("b", FINER, seed=11, first_seed=6)) == []  # of an earlier version: either seed
+
+
+def test_environments_of_an_evaluation_and_numbers_that_one_side_lacks_do_not_matter():
+    trained, evaluation = made("a", num_envs=16, workers=2), again("b", FINER, num_envs=16, workers=8)
+    assert cells(trained, evaluation)[0][5] == "physics_frequency 200 Hz (100)"
+    del trained.result["task_config"]["persistent_contacts"]
+    assert cells(trained, evaluation)[0][5] == "physics_frequency 200 Hz (100)"
 
 
 def test_a_report_of_two_folders_has_the_section_and_no_row_of_the_evaluations(tmp_path: Path):

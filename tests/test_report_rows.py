@@ -65,7 +65,40 @@ def test_a_run_that_was_repeated_counts_once(tmp_path: Path):
     write(tmp_path / "other", seed=11, config_digest="b" * 12)
     assert cells(tmp_path) == [("affordance", "2", "50.0, 50.0")]
     write(tmp_path / "elsewhere", config_digest="a" * 12, first_seed=7)  # the same policy on other starts
-    assert cells(tmp_path)[0][1] == "3"
+    assert cells(tmp_path) == [("affordance", "2", "50.0, 50.0, 50.0")]
+
+
+def test_a_run_that_was_repeated_on_another_machine_or_with_more_episodes_counts_once(tmp_path: Path):
+    """Its digest is another one then; what tells seeds of a row from repetitions is what the row is made of."""
+    known: dict[str, Any] = {"learner_config": {"gamma": 0.9}, "training_config": {"stagger": True}, "num_envs": 16}
+    for k, (workers, episodes) in enumerate(((2, 200), (2, 500), (None, 100))):
+        count = {"num_envs": 32} if workers is None else {}
+        more: Any = known | {"workers": workers, "config_digest": f"{k}" * 12} | count
+        write(tmp_path / f"run{k}", episodes=episodes, rate=0.5 + k / 100, **more)
+    assert cells(tmp_path) == [("affordance", "1", "51.0")]
+    write(tmp_path / "other", **known | {"workers": 2, "learner_config": {"gamma": 0.5}})
+    assert sorted(seeds for _, seeds, _ in cells(tmp_path)) == ["1", "1"]
+
+
+def test_evaluations_of_policies_are_told_apart_by_their_files(tmp_path: Path):
+    """Not by their paths, which may be the same for several, or several for the same."""
+    for k, (path, digest) in enumerate((("best", "x"), ("/a/best", "x"), ("best", "y"), ("best", "z"))):
+        more: Any = {"checkpoint": path, "policy_seed": 10 + (digest == "z"), "policy_digest": digest}
+        write(tmp_path / f"run{k}", config_digest="a" * 12, **more)
+    assert cells(tmp_path) == [("affordance", "3", "50.0, 50.0, 50.0")]
+    (row,) = table_rows(find_runs(tmp_path))
+    assert row[2] == "PPO, evaluated again"
+    assert row[-1] == "-"  # minutes: nothing was trained
+
+
+def test_runs_behind_links_are_found_once_and_loops_end(tmp_path: Path):
+    write(tmp_path / "disk" / "one")
+    (tmp_path / "runs").mkdir()
+    write(tmp_path / "runs" / "two", seed=11)
+    (tmp_path / "runs" / "linked").symlink_to(tmp_path / "disk")
+    (tmp_path / "runs" / "again").symlink_to(tmp_path / "disk" / "one")
+    (tmp_path / "runs" / "loop").symlink_to(tmp_path / "runs")
+    assert cells(tmp_path / "runs") == [("affordance", "2", "50.0, 50.0")]
 
 
 def test_curves_of_runs_that_were_evaluated_at_other_steps_are_compared_at_the_same_ones():

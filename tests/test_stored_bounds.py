@@ -120,6 +120,17 @@ def test_a_table_of_episodes_has_no_more_columns_and_no_longer_names(tmp_path: P
             read_episodes(path)
 
 
+@pytest.mark.parametrize("numbers", [(1, 0, 2), (0, 1, 3), (1, 2, 3), (0, 0, 1), (0.5, 1, 2)])
+def test_episodes_that_are_not_in_their_order_are_refused(tmp_path: Path, numbers: tuple[float, ...]):
+    """Such as of a table that was sorted: tables of episodes are compared row by row."""
+    path = tmp_path / "eval.csv"
+    path.write_text("episode,success\n0,1\n1,0\n2,1\n")
+    assert read_episodes(path)["success"] == [1.0, 0.0, 1.0]
+    path.write_text("episode,success\n" + "".join(f"{number},1\n" for number in numbers))
+    with pytest.raises(InputError, match=r"its episodes are not 0, 1, 2, \.\.\. from line to line"):
+        read_episodes(path)
+
+
 def test_a_table_agrees_with_the_share_and_the_number_that_are_known():
     path, episodes = Path("eval.csv"), {"success": [1.0, 0.0, 0.0]}
     for share, count in ((None, None), (0.3333, 3), (1 / 3, None), (None, 3), (0.33339, 3)):

@@ -17,6 +17,7 @@ from dora.commands import sweep as command
 from dora.configs import plain
 from dora.errors import InputError
 from dora.sweeps import ray_cluster
+from dora.sweeps.finished import finished_runs
 from dora.sweeps.launching import NOT_THE_RUN, LocalLauncher, prepare, steps_of
 from dora.sweeps.plan import rows_of
 from dora.sweeps.sweep import State, Sweep
@@ -132,6 +133,35 @@ def test_why_a_run_of_a_smaller_budget_could_not_be_gone_on_with_is_told(tmp_pat
     sweep.run(fake("fails"), nothing, nothing)
     assert states(sweep) == [State.FAILED]
     assert sweep.entries[0].complaint == "status 1: the disk is full"
+
+
+def test_a_folder_behind_a_link_is_found(tmp_path: Path):
+    """Such as one on a larger disk."""
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "DoraCube-v1").symlink_to(tmp_path / "disk")
+    sweep = Sweep(few(2), tmp_path / "out", retries=0)
+    sweep.run(fake("well"), nothing, nothing)
+    assert states(sweep) == [State.DONE] * 2
+    assert states(Sweep(few(2), tmp_path / "out")) == [State.DONE] * 2
+
+
+def test_runs_that_wait_for_a_larger_budget_are_not_looked_for_everywhere(tmp_path: Path, monkeypatch):
+    """Reading all results in every turn would keep a core busy beside the training."""
+    seen: list[list[Path]] = []
+
+    def looked(folders, strict=True):
+        seen.append(list(folders))
+        return finished_runs(seen[-1], strict)
+
+    monkeypatch.setattr(dora.sweeps.sweep, "finished_runs", looked)
+    Sweep(short_rows(1000), tmp_path).run(fake("well"), nothing, nothing)
+    sweep = Sweep(short_rows(2000), tmp_path)
+    seen.clear()
+    sweep.run(fake("well"), nothing, nothing)
+    assert states(sweep) == [State.DONE]
+    assert seen
+    assert {folder for folders in seen for folder in folders} == {sweep.entries[0].folder}
 
 
 def test_a_disk_that_fills_up_fails_one_run_and_not_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -39,6 +39,7 @@ from dora.agents.runs.run_folder import RunFolder, make_result
 from dora.agents.runs.stored_results import read_result
 from dora.agents.runs.trainer import Trainer
 from dora.configs import plain
+from dora.digests import file_sha256
 from dora.errors import FAILED, RECORDS, InputError, RunFailure, command
 from dora.tasks import find_task, make_task
 from dora.tasks.env.options import numbers_under_preset, task_config
@@ -332,6 +333,7 @@ def evaluate_only(args: Args) -> Path:
     folder.check_free()
     os.environ[RECORDS] = str(folder.nonfinite.absolute())  # processes that are started later see it, too
     progress: dict[str, Any] = {"env_steps": 0, "wall_seconds": 0.0, "episodes": 0, "curve": []}
+    policy = dict[str, Any]()
 
     def begin() -> None:
         folder.create(config, evaluation=True)
@@ -348,12 +350,13 @@ def evaluate_only(args: Args) -> Path:
         options: Any = {"zero": args.zero_correction, "first_seed": args.first_seed, "before": begin}
         checkpoint, evaluation, zero = evaluate_checkpoint(path, *settings, **options)
         progress = {name: checkpoint.progress.get(name, value) for name, value in progress.items()}
+        policy = {"policy_seed": checkpoint.config.seed, "policy_digest": file_sha256(path)}  # `seed` may be another
         print(outcome(evaluation, zero), file=sys.stderr)
     folder.write_evaluation(evaluation, zero if path else None)
     if path is not None and (said := agreement(path, folder.path / "eval.csv", config, args.first_seed)):
         print(said, file=sys.stderr)
     result = make_result(config, evaluation=evaluation, zero=zero, finished=True, commit=commit, **progress)
-    folder.write_result(result | {"agent": agent, "checkpoint": None if path is None else str(path)})
+    folder.write_result(result | policy | {"agent": agent, "checkpoint": None if path is None else str(path)})
     return folder.path
 
 

@@ -7,6 +7,7 @@ from statistics import mean
 
 from dora.agents.runs.stored_results import read_result
 from dora.errors import InputError
+from dora.files import files_under
 from dora.sweeps.plan import Row
 
 EXPECTED = {"DoraCube-v1": 1.1e-3, "DoraJug-v1": 1.9e-3, "DoraHammer-v1": 3.4e-3, "DoraMicrowave-v1": 3.3e-3}
@@ -51,7 +52,7 @@ def finished_runs(folders: Iterable[Path], strict: bool = True) -> list[Finished
         InputError: a result.json is damaged.
     """
     found = []
-    for path in sorted({path for folder in folders for path in folder.rglob("result.json")}):
+    for path in sorted({path for folder in folders for path in files_under(folder, "result.json")}):
         try:
             result = read_result(path)
         except InputError:

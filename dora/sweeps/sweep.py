@@ -156,7 +156,7 @@ class Sweep:
 
     def _note_end(self, row: Row, complaint: str | None) -> None:
         entry = next(entry for entry in self.entries if entry.row is row)
-        self._settle(entry, self._found())
+        self._settle(entry, finished_runs([entry.folder], strict=False))
         if entry.state is State.DONE:
             return
         if complaint is not None and is_locked(entry.folder):  # another process was there first, and trains in it
@@ -173,7 +173,7 @@ class Sweep:
                     locked = is_locked(entry.folder)
                     entry.state = State.ELSEWHERE if locked else State.WAITING
                     if not locked and is_finished(entry.folder):
-                        self._settle(entry, self._found())
+                        self._settle(entry, finished_runs([entry.folder], strict=False))
                 except (InputError, OSError) as error:  # its folder is no good; the others may be
                     entry.state, entry.complaint = State.FAILED, str(error)
 

@@ -6,11 +6,9 @@ from statistics import mean
 import numpy as np
 
 from dora.agents.reports.paper import BETTER, JUG_GAIN, MEAN_GAIN, ONE_ARM, PAPER, Cell
-from dora.agents.reports.run_results import Run
-from dora.agents.reports.section import NONE, NORMAL, Section, error_of, rate_of
+from dora.agents.reports.run_results import Run, same_task, seeds_of
+from dora.agents.reports.section import FEWEST, NONE, NORMAL, Section, error_of, rate_of
 
-FEWEST = 3
-"""Seeds of every cell that a verdict needs [1]."""
 EXACT = 1e-9
 """Standard error below which a rate counts as exact [points]."""
 
@@ -37,14 +35,24 @@ class Rates:
 
     def verdict(self, needed: Sequence[Cell], margin: float, error: float, words: tuple[str, str]) -> str | None:
         """The first word if `margin` is above zero by more than 1.96 standard errors, the second if it is as far below,
-        else "undecided"; a sentence where cells have too few seeds, and None where one has no run."""
+        else "undecided"; a sentence where cells have too few seeds or are of other tasks, None where one has no run."""
         if not set(needed) <= set(self.cells):
             return None
-        fewest = min(len({run.result.get("seed") for run in self.cells[cell]}) for cell in needed)
+        fewest = min(seeds_of(self.cells[cell]) for cell in needed)
         if fewest < FEWEST:
             return f"too few runs: {fewest} of {FEWEST} seeds"
+        if others := self.other_tasks(needed):
+            return f"cannot be said: runs of {', '.join(others)} have other numbers of the task"
         sure = np.isfinite(error) and abs(margin) > NORMAL * error
         return words[margin < 0] if sure else "undecided"
+
+    def other_tasks(self, needed: Sequence[Cell]) -> list[str]:
+        """Tasks in which some of these cells have other numbers than others."""
+        found = {}
+        for env in dict.fromkeys(env for env, *_ in needed):
+            first, *others = [self.cells[cell][0] for cell in needed if cell[0] == env]
+            found[env] = all(same_task(first, other) for other in others)
+        return [env for env, alike in found.items() if not alike]
 
     def row(
         self,

@@ -11,25 +11,33 @@ from dora.agents.reports.gains import gains, gains_of_regions, how_soon
 from dora.agents.reports.paper import DIFFERENCES, ONE_ARM, PAPER, Cell
 from dora.agents.reports.run_results import (
     DEFAULT_PRESET,
+    NO_CORRECTION,
+    OF_CANDIDATES,
     SHARED,
     UNKNOWN,
     Run,
     grouped,
     in_words,
+    most_frequent,
+    seeds_of,
     shared_mark,
+    task_numbers,
     zero_episodes,
-    zero_shares,
 )
-from dora.agents.reports.section import NONE, OVERLAP, Section, outcomes_of, rate_of, success_of, with_interval
+from dora.agents.reports.section import (
+    FEWEST,
+    NONE,
+    OVERLAP,
+    TOO_NARROW,
+    Section,
+    mean_of,
+    outcomes_of,
+    rate_of,
+    success_of,
+    with_interval,
+)
 from dora.agents.reports.statistics import aggregates, crossed_interval, paired_difference
 
-TOO_NARROW = (
-    "Of a few seeds it is too narrow: of three that differ by 1 point (standard deviation) it covers the true mean in "
-    "95 of 100 cases, by 2.4 points in 90, by 5 in 84, by 11 in 76."
-)
-"""What bootstrap intervals over seeds leave out; measured on invented runs of three seeds and 500 starts."""
-SWITCHES = ("optimised",)
-"""Switches of tasks that choose between variants of them."""
 TOLD = (("reorient", "in_hand"), ("hand_action", "fingers"))
 """Numbers of tasks that make another task of one, also where all runs have them."""
 
@@ -53,14 +61,14 @@ def sections(runs: Sequence[Run]) -> list[Section]:
 
 def of_the_paper(runs: Sequence[Run]) -> dict[Cell, list[Run]]:
     """The runs of each cell of the paper's tables: preset `standard`, the task's own reward, trained. Of several
-    budgets the largest with which the task was run with guidance, so that all its cells have the same; of several
-    variants of a task's numbers that with most runs by its present rules, the first of equals."""
+    budgets one for all cells of a task, see `_budget`; of several variants of a task's numbers that with most runs by
+    its present rules, the first of equals."""
     groups = {
         (env, agent, guidance.partition(",")[0], thousands, guidance): members
         for (env, preset, agent, guidance, thousands), members in grouped(runs).items()
         if preset == DEFAULT_PRESET and (env, agent, guidance.partition(",")[0]) in PAPER
     }
-    budget = {env: _budget([group for group in groups if group[0] == env]) for env, *_ in groups}
+    budget = {env: _budget({group: some for group, some in groups.items() if group[0] == env}) for env, *_ in groups}
     found: dict[Cell, list[Run]] = {}
     for (env, agent, guidance, thousands, _), members in groups.items():
         cell = env, agent, guidance
@@ -74,14 +82,20 @@ def _worth(runs: Sequence[Run]) -> tuple[int, int]:
     return sum(not run.outdated for run in runs), len(runs)
 
 
-def _budget(groups: Sequence[tuple[str, str, str, int, str]]) -> int:
-    """The budget of a task in the tables [thousand steps].
+def _budget(groups: Mapping[tuple[str, str, str, int, str], list[Run]]) -> int:
+    """The budget of a task in the tables [thousand steps]: the largest with which it was run by its present rules, with
+    guidance, with enough seeds for a verdict; where there is none, what is left of these conditions.
 
     Args:
-        groups: task, learner, guidance, budget and variant of its runs.
+        groups: runs by task, learner, guidance, budget and variant.
     """
-    guided = [thousands for _, _, guidance, thousands, _ in groups if guidance == "affordance"]
-    return max(guided or [thousands for *_, thousands, _ in groups])
+
+    def order(group: tuple[str, str, str, int, str]) -> tuple[bool, bool, bool, int]:
+        members = groups[group]
+        enough = seeds_of(members) >= FEWEST
+        return not members[0].outdated, group[2] == "affordance", enough, group[3]
+
+    return max(groups, key=order)[3]
 
 
 def variant(runs: Sequence[Run]) -> str:
@@ -92,14 +106,27 @@ def variant(runs: Sequence[Run]) -> str:
     words += [
         in_words(name, str(value))
         for name, value in (run.result.get("task_config") or {}).items()
-        if (name in SWITCHES and isinstance(value, bool) and run.result["guidance"] != "none")
+        if (name in OF_CANDIDATES and isinstance(value, bool) and run.result["guidance"] != "none")
         or (name, str(value)) in TOLD
     ]
     return ", ".join(dict.fromkeys([f"{run.budget / 1000:.0f}k", *words]))
 
 
+def other_numbers(cells: Mapping[Cell, list[Run]]) -> dict[Cell, list[str]]:
+    """In words, the numbers of the task in which a cell differs from most cells of its task that have them."""
+    found: dict[Cell, list[str]] = {cell: [] for cell in cells}
+    for env in dict.fromkeys(env for env, *_ in cells):
+        numbers = {cell: task_numbers(runs[0]) for cell, runs in cells.items() if cell[0] == env}
+        for name in sorted({name for each in numbers.values() for name in each} - set(OF_CANDIDATES)):
+            values = {cell: str(each[name]) for cell, each in numbers.items() if name in each}
+            usual = most_frequent(list(values.values()))
+            for cell, value in values.items():
+                found[cell] += [in_words(name, value)] if value != usual and (name, value) not in TOLD else []
+    return found
+
+
 def _success(cells: Mapping[Cell, list[Run]]) -> Section:
-    rows = []
+    rows, own = [], other_numbers(cells)
     for cell, printed in PAPER.items():
         runs = cells.get(cell, [])
         ours = raw = NONE
@@ -110,9 +137,10 @@ def _success(cells: Mapping[Cell, list[Run]]) -> Section:
                 if outcomes is None
                 else with_interval(outcomes.mean(), crossed_interval(outcomes))
             )
-            known = [run.result.get("raw_success_rate") for run in runs]
-            raw = NONE if None in known else f"{100 * mean(rate for rate in known if rate is not None):.1f}"
-        about = [str(len(runs)), variant(runs) if runs else NONE]
+            known = [(run.result.get("raw_success_rate"), run.result.get("eval_episodes", 0)) for run in runs]
+            told = [(rate, count) for rate, count in known if rate is not None]
+            raw = f"{mean_of(told):.1f}" if len(told) == len(known) else NONE
+        about = [str(seeds_of(runs)), ", ".join([variant(runs), *own[cell]]) if runs else NONE]
         rows.append([*cell, *about, ours, raw, f"{printed.success:.1f} ± {printed.deviation:.1f}"])
     head = (
         "task",
@@ -135,11 +163,11 @@ def _minutes(cells: Mapping[Cell, list[Run]]) -> Section:
     rows = [
         [
             *cell,
-            f"{mean(run.minutes for run in cells[cell]):.1f}{shared_mark(cells[cell])}",
+            f"{mean(known):.1f}{shared_mark(cells[cell])}",
             f"{printed.minutes:.1f}",
         ]
         for cell, printed in PAPER.items()
-        if cell in cells and printed.minutes is not None
+        if printed.minutes is not None and (known := [m for r in cells.get(cell, []) if (m := r.minutes) is not None])
     ]
     note = (
         "Ours on two CPU cores with all evaluations, the paper's on an RTX 4090. Marks as in the table of all runs: "
@@ -167,7 +195,7 @@ def _training(cells: Mapping[Cell, list[Run]]) -> str:
     for run in (run for runs in cells.values() for run in runs):
         settings = run.result.get("learner_config") or {}
         size = settings.get("minibatch", settings.get("batch"))
-        if size is not None:
+        if isinstance(size, int):
             agents.setdefault(size, set()).add(run.result["agent"].upper())
     known = " and ".join(f"{size} ({', '.join(sorted(some))})" for size, some in sorted(agents.items(), reverse=True))
     return steps + (f", minibatches of {known}" if known else "")
@@ -211,15 +239,17 @@ def _aggregated(cells: Mapping[Cell, list[Run]]) -> list[Section]:
 def _differences(runs: Sequence[Run]) -> Section:
     rows = []
     for (env, preset, agent, guidance, _), members in grouped(runs).items():
-        zero = outcomes_of(zero_episodes(members), [run.result.get("first_seed") for run in members])
-        ours = success_of(members)
+        known = [run for run in members if run.result["zero_success_rate"] is not None]
+        if not known or members[0].result["agent"] == NO_CORRECTION:
+            continue
+        zero = outcomes_of(zero_episodes(known), [run.result.get("first_seed") for run in known])
+        ours = success_of(known)
         if zero is not None and ours is not None and zero.shape[1] == ours.shape[1]:
             text = with_interval(*paired_difference(ours, zero), sign=True)
-        elif zero_shares(members):
-            text = f"{rate_of(members) - 100 * mean(share for share, _ in zero_shares(members)):+.1f}"
         else:
-            continue
-        rows.append([env, preset, agent, guidance, str(len(members)), text])
+            on_the_same = [(run.result["zero_success_rate"], run.result.get("eval_episodes", 0)) for run in known]
+            text = f"{rate_of(known) - mean_of(on_the_same):+.1f}"
+        rows.append([env, preset, agent, guidance, str(seeds_of(known)), text])
     note = (
         f"In brackets the bootstrap interval over seeds and starts, where the episodes of both are there. {TOO_NARROW}"
     )
@@ -231,12 +261,15 @@ def _stages(runs: Sequence[Run]) -> Section:
     rows = []
     for (env, preset, agent, guidance, _), members in grouped(runs).items():
         names = list(members[0].result.get("stage_rates") or {})
-        rates = [[run.result.get("stage_rates", {}).get(name) for run in members] for name in names]
+        counts = [run.result.get("eval_episodes", 0) for run in members]
+        rates = {name: [run.result.get("stage_rates", {}).get(name) for run in members] for name in names}
         known = [
-            (name, mean(r)) for name, r in zip(names, rates, strict=True) if all(isinstance(x, float | int) for x in r)
+            f"{name} {mean_of(list(zip(each, counts, strict=True))):.1f}"
+            for name, each in rates.items()
+            if all(isinstance(rate, float | int) for rate in each)
         ]
         if known:
-            rows.append([env, preset, agent, guidance, ", ".join(f"{name} {100 * rate:.1f}" for name, rate in known)])
+            rows.append([env, preset, agent, guidance, ", ".join(known)])
     return Section(
         "Sub-tasks: share of episodes that reach each stage",
         ("task", "preset", "learner", "guidance", "stages %"),

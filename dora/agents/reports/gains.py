@@ -4,12 +4,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from statistics import mean
 
 from dora.agents.reports.paper import PAPER, Cell
-from dora.agents.reports.run_results import SECONDS_PER_MINUTE, Group, Run, grouped, shared_mark
-from dora.agents.reports.section import NONE, Section, rate_of, success_of, with_interval
+from dora.agents.reports.run_results import (
+    SECONDS_PER_MINUTE,
+    Group,
+    Run,
+    grouped,
+    same_task,
+    same_values,
+    seeds_of,
+    shared_mark,
+)
+from dora.agents.reports.section import FEWEST, NONE, TOO_NARROW, Section, rate_of, success_of, with_interval
 from dora.agents.reports.statistics import mean_of_curve, paired_difference
 
-OF_CANDIDATES = ("optimised",)
-"""Switches of tasks that choose the candidates of `affordance`, in which these may differ from `grasps`."""
+OTHER_TASK = "the tasks have other numbers"
+"""In the place of a difference between runs that did not do the same."""
 IN_STEPS, IN_MINUTES = (0.5, 0.8), (0.5, 0.8, 0.9)
 """Shares of successes in training's evaluations whose steps and whose minutes are told [1]."""
 
@@ -19,9 +28,9 @@ def gains(cells: Mapping[Cell, list[Run]]) -> Section:
     rows = []
     for env, agent, guided, plain in _pairs(cells):
         printed = PAPER[env, agent, "affordance"].success - PAPER[env, agent, "none"].success
-        final = rate_of(guided) - rate_of(plain)
+        final = f"{rate_of(guided) - rate_of(plain):+.1f}" if same_task(guided[0], plain[0]) else OTHER_TASK
         soon = (_steps(runs) for runs in (guided, plain))
-        rows.append([env, agent, f"{final:+.1f}", f"{printed:+.1f}", _gain_of_mean(guided, plain), *soon])
+        rows.append([env, agent, final, f"{printed:+.1f}", _gain_of_mean(guided, plain), *soon])
     head = ("task", "learner", "gain", "gain in the paper", "gain of the mean over training",
             "steps to 80 %, guided", "steps to 80 %, unguided")  # fmt: skip
     note = (
@@ -42,7 +51,9 @@ def gains_of_regions(runs: Sequence[Run]) -> Section:
             value, (low, high) = paired_difference(ours, theirs)
             final = with_interval(value, (low, high), sign=True)
             verdict = "more" if low > 0 else "less" if high < 0 else "not told apart"
-        seeds = f"{len(guided)}, {len(plain)}"
+        fewest = min(seeds_of(guided), seeds_of(plain))
+        verdict = f"too few runs: {fewest} of {FEWEST} seeds" if verdict != NONE and fewest < FEWEST else verdict
+        seeds = f"{seeds_of(guided)}, {seeds_of(plain)}"
         soon = (_steps(some) for some in (guided, plain))
         rows.append([env, preset, agent, guidance, seeds, final, verdict, _gain_of_mean(guided, plain), *soon])
     head = ("task", "preset", "learner", "guidance", "seeds of each", "points more than with `grasps`", "verdict",
@@ -50,7 +61,7 @@ def gains_of_regions(runs: Sequence[Run]) -> Section:
     note = (
         "The same reference motion, learner, budget and starts; the candidates of `grasps` are of a search without "
         "regions. (A grasp made by hand is of no search: its row does not tell what regions gain.) In brackets the "
-        "bootstrap interval over seeds and starts."
+        f"bootstrap interval over seeds and starts. {TOO_NARROW}"
     )
     return Section("What regions gain: affordance less grasps", head, rows, note)
 
@@ -82,10 +93,18 @@ def _reached(runs: Sequence[Run], share: float, column: str, unit: float | int, 
 
 
 def _steps(runs: Sequence[Run]) -> str:
-    """Steps to 80 % of the seeds that reached it."""
-    known = [run.result.get("steps_to_80") for run in runs]
+    """Steps to 80 % of the seeds that reached it, of those whose evaluations are known."""
+    told = [run for run in runs if run.curve or "steps_to_80" in run.result]
+    known = [run.result["steps_to_80"] if "steps_to_80" in run.result else _steps_to(run, 0.8) for run in told]
     reached = [steps for steps in known if steps is not None]
+    if not known:
+        return NONE
     return f"{mean(reached) / 1000:.0f}k ({len(reached)} of {len(known)})" if reached else f"never (0 of {len(known)})"
+
+
+def _steps_to(run: Run, share: float) -> float | None:
+    """Steps of the first evaluation during training with such a share of successes."""
+    return next((row["env_steps"] for row in run.curve if row["success_rate"] >= share), None)
 
 
 def _gain_of_mean(guided: Sequence[Run], plain: Sequence[Run]) -> str:
@@ -115,5 +134,4 @@ def _same_but_regions(runs: Sequence[Run]) -> Iterator[tuple[list[Run], list[Run
 
 def _alike(one: Run, other: Run) -> bool:
     """Whether two runs have the same settings, of those that are known of both, whatever chooses the candidates."""
-    first, second = one.settings, other.settings
-    return all(first[name] == second[name] for name in first.keys() & second.keys() - set(OF_CANDIDATES))
+    return same_values(one.settings, other.settings)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from dora.agents.reports.run_results import Group, Run, grouped
-from dora.agents.reports.section import NONE, OVERLAP, Section, rate_of, success_of, with_interval
+from dora.agents.reports.run_results import Group, Run, grouped, seeds_of
+from dora.agents.reports.section import NONE, OVERLAP, TOO_NARROW, Section, rate_of, success_of, with_interval
 from dora.agents.reports.statistics import difference_of_pairs
 
 PHYSICS = ("physics_frequency", "solver_iterations", "contact_offset", "persistent_contacts")
@@ -31,13 +31,13 @@ class Check:
         return ", ".join(
             f"{name} {there[name]}{UNITS.get(name, '')} ({here[name]})"
             for name in PHYSICS
-            if there.get(name) != here.get(name)
+            if name in there and name in here and there[name] != here[name]
         )
 
 
 def apart(runs: Sequence[Run]) -> tuple[list[Run], list[Check]]:
     """Runs without those evaluations that differ from a training among them in physics alone, and these evaluations."""
-    trained = [run for run in runs if not run.result.get("checkpoint")]
+    trained = [run for run in runs if not run.evaluated_again]
     checks = [check for run in runs for check in _of_trained(run, trained)]
     taken = {check.run.folder for check in checks}
     return [run for run in runs if run.folder not in taken], checks
@@ -45,18 +45,31 @@ def apart(runs: Sequence[Run]) -> tuple[list[Run], list[Check]]:
 
 def _of_trained(run: Run, trained: Sequence[Run]) -> Iterator[Check]:
     """The evaluation with the run of its policy, if it is one under other physics."""
-    if not run.result.get("checkpoint") or not run.result.get("task_config"):
+    if not run.evaluated_again or not run.result.get("task_config"):
         return
-    own, seed = _others(run), run.result.get("seed")
+    own = _others(run)
     for other in trained:
         theirs = _others(other)
         common = own.keys() & theirs.keys()
-        named = other.result.get("task_config") and other.result.get("seed") == seed
-        if named and _kind(run) == _kind(other) and all(own[name] == theirs[name] for name in common):
+        alike = _kind(run) == _kind(other) and all(own[name] == theirs[name] for name in common)
+        if other.result.get("task_config") and alike and _same_policy(run, other):
             check = Check(run, other)
             if check.physics:
                 yield check
             return
+
+
+def _same_policy(run: Run, trained: Run) -> bool:
+    """Whether an evaluation is of the policy of a training: by the file's digest where both are known, else by the
+    training's seed. Results of earlier versions have the seed of their starts alone, which is that of the training
+    where the starts are its own."""
+    ours, theirs = run.result, trained.result
+    digests = [result.get("policy_digest") for result in (ours, theirs)]
+    if None not in digests:
+        return digests[0] == digests[1]
+    if ours.get("policy_seed") is not None:
+        return ours["policy_seed"] == theirs.get("seed")
+    return ours.get("seed") == theirs.get("seed") and ours.get("first_seed") == theirs.get("first_seed")
 
 
 def _kind(run: Run) -> tuple[Any, ...]:
@@ -66,8 +79,9 @@ def _kind(run: Run) -> tuple[Any, ...]:
 
 
 def _others(run: Run) -> dict[str, Any]:
-    """Settings of a run but for its physics; results of earlier versions do not have all."""
-    return {name: value for name, value in run.settings.items() if name not in PHYSICS}
+    """Settings of a run but for its physics, and for the number of environments, which an evaluation may choose anew;
+    results of earlier versions do not have all."""
+    return {name: value for name, value in run.settings.items() if name not in (*PHYSICS, "environments")}
 
 
 def physics_section(runs: Sequence[Run], checks: Sequence[Check]) -> Section:
@@ -85,15 +99,16 @@ def physics_section(runs: Sequence[Run], checks: Sequence[Check]) -> Section:
     for ((env, preset, agent, guidance, _), physics), members in sorted(found.items()):
         there, here = [check.run for check in members], [check.trained for check in members]
         rows.append(
-            [env, preset, agent, guidance, str(len(members)), physics, f"{rate_of(here):.1f}", f"{rate_of(there):.1f}",
+            [env, preset, agent, guidance, str(seeds_of(here)), physics,
+             f"{rate_of(here):.1f}", f"{rate_of(there):.1f}",
              _difference(there, here), _overlap(here), _overlap(there), _scripted(here), _scripted(there)]
         )  # fmt: skip
     head = ("task", "preset", "learner", "guidance", "seeds", "physics (in training)", "success as trained %",
             "success %", "points", "overlap p95 as trained [mm]", "overlap p95 [mm]", "scripted as trained %",
             "scripted %")  # fmt: skip
     note = (
-        "The policies of training, not trained again. Differences are of the same policies on the same starts, in "
-        "brackets the bootstrap interval over seeds and starts."
+        "The policies of training, not trained again. Differences with an interval are of the starts that both have, "
+        "and the interval is the bootstrap's over seeds and starts; without one the starts are others. " + TOO_NARROW
     )
     return Section("Trained policies under other physics", head, rows, note)
 
@@ -101,9 +116,10 @@ def physics_section(runs: Sequence[Run], checks: Sequence[Check]) -> Section:
 def _difference(there: Sequence[Run], here: Sequence[Run]) -> str:
     ours, theirs = success_of(there), success_of(here)
     starts = {run.result.get("first_seed") for run in (*there, *here)}
-    if ours is None or theirs is None or ours.shape != theirs.shape or len(starts) > 1:
+    if ours is None or theirs is None or len(starts) > 1:
         return f"{rate_of(there) - rate_of(here):+.1f}"
-    return with_interval(*difference_of_pairs(ours, theirs), sign=True)
+    common = min(ours.shape[1], theirs.shape[1])
+    return with_interval(*difference_of_pairs(ours[:, :common], theirs[:, :common]), sign=True)
 
 
 def _overlap(runs: Sequence[Run]) -> str:

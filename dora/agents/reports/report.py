@@ -18,6 +18,7 @@ from dora.agents.reports.run_results import (
     Run,
     find_runs,
     grouped,
+    seeds_of,
     several,
     shared_mark,
     success_shares,
@@ -106,7 +107,7 @@ def table_rows(runs: Sequence[Run]) -> list[list[str]]:
     rows = []
     for (env, preset, agent, guidance, thousands), members in grouped(runs).items():
         rows.append([
-            env, preset, agent, guidance, str(len(members)),
+            env, preset, agent, guidance, str(seeds_of(members)),
             pooled(success_shares(members)),
             ", ".join(f"{100 * share:.1f}" for share, _ in success_shares(members)),
             pooled(zero_shares(members)),
@@ -143,12 +144,13 @@ def write_report(roots: Path | Sequence[Path], out: Path, rules: Mapping[str, in
     more = physics_section(runs, checks), starts_section(runs)
     compared = [*sections(runs), *(section for section in more if section.rows)]
     for env, preset in sorted({run.group[:2] for run in runs if run.curve or run.progress}):
-        name = env if preset == DEFAULT_PRESET else f"{env}-{preset}"
-        figures[f"{file_name(name)}.png"] = draw_curves(runs, env, preset)
+        name = file_name(env if preset == DEFAULT_PRESET else f"{env}-{preset}")
+        name = f"{name}-{digest_of([env, preset])[:8]}" if f"{name}.png" in figures else name
+        figures[f"{name}.png"] = draw_curves(runs, env, preset)
         if any(run.group[:2] == (env, preset) and OVERLAP in run.episodes for run in runs):
-            figures[f"{file_name(name)}-overlap.png"] = draw_overlap(runs, env, preset)
+            figures[f"{name}-overlap.png"] = draw_overlap(runs, env, preset)
         if has_starts(runs, env, preset):
-            figures[f"{file_name(name)}-starts.png"] = draw_starts(runs, env, preset)
+            figures[f"{name}-starts.png"] = draw_starts(runs, env, preset)
     pictures = [(name, base64.b64encode(content).decode()) for name, content in figures.items()]
     shown = {"head": HEADINGS, "rows": table_rows(runs), "note": NOTE, "figures": pictures, "sections": compared}
     texts = {

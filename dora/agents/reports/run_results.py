@@ -1,20 +1,21 @@
 """Finished runs as they lie in folders, and which of them make one row of a report."""
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
-from dora.agents.config import NEUTRAL, NEUTRAL_LEARNER, TRAINING, in_effect
+from dora.agents.config import NEUTRAL, NEUTRAL_LEARNER, TRAINING, WITHOUT_EFFECT, in_effect
 from dora.agents.evaluation.evaluate import FINAL_SEED
 from dora.agents.runs.progress_table import read_progress
 from dora.agents.runs.stored_results import check_agreement, read_curve, read_episodes, read_result
 from dora.configs import flat
 from dora.errors import InputError
+from dora.files import files_under
 
 SECONDS_PER_MINUTE = 60.0
 """Seconds in a minute [s]."""
@@ -26,6 +27,8 @@ ALONE = 0.1
 SHARED, UNKNOWN = " \N{DAGGER}", " ?"
 """Marks of minutes beside other programs, and of minutes of which that was not measured."""
 
+OF_CANDIDATES = ("optimised",)
+"""Switches of tasks that choose the candidates of `affordance`, in which these may differ from other guidance."""
 IN_WORDS = {
     ("optimised", "False"): "grasp made by hand",
     ("optimised", "True"): "grasps of the search",
@@ -35,6 +38,8 @@ IN_WORDS = {
 """Values of numbers of tasks, by name and value, as readers of a table know them."""
 WITHOUT_OVERLAP = {"after_overlap": "1.0", "placed_after_overlap": "1.0", "weights.penetration": "0.0"}
 """Numbers of a task with which its reward does not depend on overlap: named together."""
+NO_CORRECTION = "zero"
+"""Agent of evaluations of zero correction alone."""
 ALWAYS = ("optimised",)
 """Numbers of tasks that are named whatever most runs of a row have, since neither of their values is the usual one."""
 
@@ -43,6 +48,8 @@ EASED = ", overlap eased"
 EARLIER = ", earlier rules"
 """What is added to the guidance of runs whose task has other rules now."""
 
+Value = TypeVar("Value", bound=Hashable)
+"""What is counted."""
 Group = tuple[str, str, str, str, int]
 """Environment, preset, agent, guidance, steps in thousands (rounded): what the runs of one row of the table share."""
 
@@ -69,19 +76,32 @@ class Run:
         another reward than the usual one, and whether it was only evaluated."""
         result = self.result
         task = result if "preset" in result else result.get("task", {})
-        parts = task.get("guidance_parts")
-        guidance = result["guidance"] + (f" ({', '.join(parts)})" if parts else "")
+        guidance = result["guidance"] + parts_of(self)
         agent = result["agent"].upper()
         agent += ", paper's reward" if result.get("reward", "dense") == "paper" else ""
-        agent += ", evaluated again" if result.get("checkpoint") else ""
+        agent += ", evaluated again" if self.evaluated_again else ""
         guidance += EASED if result.get("overlap_share", 1.0) < 1 else ""
         guidance += EARLIER if self.outdated else ""
         return result["env"], task.get("preset", DEFAULT_PRESET), agent, guidance, round(self.budget / 1000)
 
     @property
-    def minutes(self) -> float:
-        """Wall time of the run [min]."""
-        return self.result["wall_seconds"] / SECONDS_PER_MINUTE
+    def evaluated_again(self) -> bool:
+        """It is no training, but an evaluation of a policy that was trained before."""
+        return bool(self.result.get("checkpoint"))
+
+    @property
+    def policy(self) -> tuple[Any, ...]:
+        """Tells its policy from the others of its row: the seed of its training; of an evaluation of a checkpoint also
+        the file's digest (`seed` is that of the starts there), in results of earlier versions its path."""
+        r = self.result
+        if not self.evaluated_again:
+            return (r.get("seed", self.folder),)
+        return r.get("policy_seed", r.get("seed")), r.get("policy_digest", r["checkpoint"])
+
+    @property
+    def minutes(self) -> float | None:
+        """Wall time of the training, with its evaluations [min]; None where nothing was trained."""
+        return None if self.evaluated_again else self.result["wall_seconds"] / SECONDS_PER_MINUTE
 
     @property
     def budget(self) -> int:
@@ -100,6 +120,12 @@ class Run:
         return (
             dict(flat(in_effect(r.get("task_config") or {}))) | named | (r.get("training_config") or {}) | environments
         )
+
+
+def parts_of(run: Run) -> str:
+    """The parts of guidance that a run names, as its row does."""
+    parts = (run.result if "preset" in run.result else run.result.get("task", {})).get("guidance_parts")
+    return f" ({', '.join(parts)})" if parts else ""
 
 
 def find_runs(roots: Path | Sequence[Path], rules: Mapping[str, int] | None = None) -> list[Run]:
@@ -129,7 +155,7 @@ def several(roots: Path | Sequence[Path]) -> Sequence[Path]:
 def _runs_under(root: Path, rules: Mapping[str, int]) -> list[Run]:
     """Finished runs under a folder, by path."""
     runs = []
-    for path in sorted(root.rglob("result.json")):
+    for path in files_under(root, "result.json"):
         result = read_result(path)
         curve, progress = path.with_name("curve.csv"), path.with_name("progress.csv")
         if result is not None:
@@ -145,14 +171,16 @@ def _runs_under(root: Path, rules: Mapping[str, int]) -> list[Run]:
 
 
 def _once(runs: Sequence[Run]) -> list[Run]:
-    """The runs without copies and repetitions: one with the same settings and seed is no other seed. Of several that
-    with most episodes counts, the first of equals."""
+    """The runs without copies and repetitions: one with the same settings and seed is no other seed, whatever is said
+    of the machine and the last evaluation. Of several that with most episodes counts, the first of equals."""
     found: dict[tuple[Any, ...], Run] = {}
     for run in runs:
         r = run.result
         digest = r.get("config_digest")
-        known = digest if digest is not None else (r["env_steps"], r["wall_seconds"], r["success_rate"])
-        key = run.group, r.get("seed"), known, r.get("first_seed"), r.get("checkpoint")
+        known: Any = digest if digest is not None else (r["env_steps"], r["wall_seconds"], r["success_rate"])
+        if r.get("learner_config") is not None and r.get("training_config") is not None:  # since then all are stored
+            known = sorted(map(str, run.settings.items()))
+        key = run.group, run.policy, str(known), r.get("first_seed")
         if key not in found or r.get("eval_episodes", 0) > found[key].result.get("eval_episodes", 0):
             found[key] = run
     return list(found.values())
@@ -165,9 +193,12 @@ def _with_zero(runs: Sequence[Run]) -> list[Run]:
     def starts(run: Run) -> tuple[Any, ...]:
         r = run.result
         first = r.get("first_seed", FINAL_SEED), r.get("eval_episodes")
-        return r["env"], run.group[1], run.group[3], str(sorted(flat(in_effect(r.get("task_config") or {})))), *first
+        numbers = sorted(map(str, task_numbers(run).items()))
+        return r["env"], run.group[1], run.group[3], str(numbers), *first
 
-    measured = {starts(run): run for run in runs if run.result["zero_success_rate"] is not None}
+    runs = [replace(run, zero=run.episodes) if run.result["agent"] == NO_CORRECTION else run for run in runs]
+    told = (run for run in runs if run.result["zero_success_rate"] is not None)
+    measured = {starts(run): run for run in sorted(told, key=lambda run: bool(run.zero))}  # with episodes come last
     filled = []
     for run in runs:
         other = measured.get(starts(run))
@@ -197,23 +228,20 @@ def grouped(runs: Sequence[Run]) -> dict[Group, list[Run]]:
     for (env, preset, agent, guidance, thousands), members in groups.items():
         for difference, alike in _by_task(members).items():
             row = env, preset, agent, guidance + difference, thousands
-            rows[row] = [replace(run, label=row[3].partition(", ")[2]) for run in alike]
+            words = row[3].removeprefix(alike[0].result["guidance"] + parts_of(alike[0]))
+            rows[row] = [replace(run, label=words.removeprefix(", ")) for run in alike]
     return dict(sorted(rows.items()))
 
 
 def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Runs by what the numbers of their task differ in, in words: by switches alone where these tell them apart. What
+    """Runs by what the numbers of their task differ in, in words, but for numbers that a switch brings with it. What
     more runs have than have anything else goes without saying."""
     numbers = _filled([run.settings for run in runs])
     names = sorted({name for each in numbers for name in each})
-    different = [name for name in names if len({str(each.get(name)) for each in numbers}) > 1]
-    switches = [name for name in different if isinstance(numbers[0].get(name), bool | str)]
-    by_switch, by_all = (
-        [tuple(str(each.get(name)) for name in some) for each in numbers] for some in (switches, different)
-    )
-    enough = len(set(by_switch)) == len(set(by_all))
-    names, values = (switches, by_switch) if enough else (different, by_all)
-    usual = _most_frequent(values)
+    named = [name for name in names if not _brought_along(name, numbers)]
+    names = [name for name in named if len({str(each.get(name)) for each in numbers}) > 1]
+    values = [tuple(str(each.get(name)) for name in names) for each in numbers]
+    usual = most_frequent(values)
     found: dict[str, list[Run]] = defaultdict(list)
     for run, own in zip(runs, values, strict=True):
         said = {
@@ -223,6 +251,12 @@ def _by_task(runs: Sequence[Run]) -> dict[str, list[Run]]:
         }
         found["".join(f", {words}" for words in _phrases(said))].append(run)
     return found
+
+
+def _brought_along(name: str, settings: Sequence[dict[str, Any]]) -> bool:
+    """Whether a number is there with some value of a switch alone, and the same in all runs that have it."""
+    having = {str(each[name]) for each in settings if name in each}
+    return name.partition(".")[0] in WITHOUT_EFFECT and len(having) == 1
 
 
 def _filled(settings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -236,7 +270,7 @@ def _filled(settings: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return [usual | each for each in settings]
 
 
-def _most_frequent(values: Sequence[tuple[str, ...]]) -> tuple[str, ...] | None:
+def most_frequent(values: Sequence[Value]) -> Value | None:
     """What stands more often among `values` than anything else; None if nothing does."""
     first, *others = Counter(values).most_common(2)
     return None if others and others[0][1] == first[1] else first[0]
@@ -276,9 +310,31 @@ def zero_shares(runs: Sequence[Run]) -> list[tuple[float, int]]:
     return list(found.values())
 
 
+def same_task(one: Run, other: Run) -> bool:
+    """Whether two runs have the same numbers of the task, of those that are known of both, whatever chooses the
+    candidates."""
+    return same_values(task_numbers(one), task_numbers(other))
+
+
+def task_numbers(run: Run) -> dict[str, Any]:
+    """Numbers of the task of a run that have an effect, by name; none if it does not say."""
+    known = run.result.get("task_config")
+    return dict(flat(in_effect(known))) if known else {}
+
+
+def same_values(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether settings agree, of those that are known of both, whatever chooses the candidates."""
+    return all(one[name] == other[name] for name in one.keys() & other.keys() - set(OF_CANDIDATES))
+
+
+def seeds_of(runs: Sequence[Run]) -> int:
+    """Number of trained policies among the runs, one for each seed; of zero correction, of the runs."""
+    return len({run.policy for run in runs})
+
+
 def shared_mark(runs: Sequence[Run]) -> str:
     """The mark of minutes that were not measured on a machine of their own, or of which that is not known."""
-    loads = [run.result.get("other_load") for run in runs]
+    loads = [run.result.get("other_load") for run in runs if run.minutes is not None]
     if any(load is not None and load > ALONE for load in loads):
         return SHARED
     return UNKNOWN if None in loads else ""

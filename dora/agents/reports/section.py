@@ -10,10 +10,17 @@ from jaxtyping import Float
 from dora.agents.reports.run_results import Run, success_shares
 from dora.agents.reports.statistics import Interval, crossed_interval
 
+FEWEST = 3
+"""Seeds of every side that a verdict needs [1]."""
 NONE = "-"
 """Cell of a table for which there is no run."""
 OVERLAP = "penetration_mm"
 """Column of an episode's largest overlap [mm]."""
+TOO_NARROW = (
+    "Of a few seeds it is too narrow: of three that differ by 1 point (standard deviation) it covers the true mean in "
+    "95 of 100 cases, by 2.4 points in 90, by 5 in 84, by 11 in 76."
+)
+"""What bootstrap intervals over seeds leave out; measured on invented runs of three seeds and 500 starts."""
 NORMAL = 1.96
 """Half width of a normal distribution's 95 % interval, in standard deviations [1]."""
 
@@ -57,7 +64,15 @@ def outcomes_of(
 
 def rate_of(runs: Sequence[Run]) -> float:
     """Success over the episodes of all runs [%]; the mean of their rates where it is not known how many there were."""
-    shares = success_shares(runs)
+    return mean_of(success_shares(runs))
+
+
+def mean_of(shares: Sequence[tuple[float, int]]) -> float:
+    """A share over the episodes of all runs [%]; the mean of the shares where it is not known how many there were.
+
+    Args:
+        shares: of each run, and its episodes.
+    """
     trials = sum(n for _, n in shares)
     return 100 * (sum(s * n for s, n in shares) / trials if all(n for _, n in shares) else mean(s for s, _ in shares))
 

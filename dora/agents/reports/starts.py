@@ -1,14 +1,17 @@
 """Success against how episodes began: error of the candidate, mass, friction and size."""
 
 import io
+import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from dora.agents.reports.comparison import Section
-from dora.agents.reports.figures import COLOURS, shortened
-from dora.agents.reports.run_results import Run, grouped, zero_episodes
+from dora.agents.reports.figures import COLOURS, OTHERS, shortened
+from dora.agents.reports.run_results import Run, grouped, seeds_of, zero_episodes
+from dora.agents.reports.section import Section
 from dora.tables import wilson
 
 PREFIX = "start/"
@@ -73,6 +76,41 @@ def has_starts(runs: Sequence[Run], env: str, preset: str) -> bool:
     return any(run.group[:2] == (env, preset) and any(map(_is_start, run.episodes)) for run in runs)
 
 
+@dataclass(frozen=True)
+class Line:
+    """A line of the figure.
+
+    Attributes:
+        episodes: columns, of all seeds.
+        style: of the line: dotted for zero correction.
+        colour: the same in every picture, for zero correction that of the first learner that has it.
+        label: in the legend.
+    """
+
+    episodes: Episodes
+    style: str
+    colour: str
+    label: str
+
+
+def _lines(runs: Sequence[Run], env: str, preset: str) -> list[Line]:
+    """Learners and guidance of a task and preset, and zero correction once where it is that of lines before."""
+    lines, seen, others = list[Line](), set[bytes](), itertools.cycle(OTHERS)
+    for group, members in grouped(runs).items():
+        if group[:2] == (env, preset):
+            colour = COLOURS.get(group[2:4]) or next(others)
+            for tables, style in (([m.episodes for m in members], "-"), (zero_episodes(members), ":")):
+                episodes = joined(tables)
+                drawn = (name for name in sorted(episodes) if _is_start(name) or name == "success")
+                key = b"".join(np.asarray(episodes[name]).tobytes() for name in drawn)
+                if episodes and (style == "-" or key not in seen):
+                    seen.add(key)
+                    what = "" if style == "-" else ", zero correction"
+                    label = f"{shortened(group[2])}, guidance {shortened(group[3])} ({seeds_of(members)}){what}"
+                    lines.append(Line(episodes, style, colour, label))
+    return lines
+
+
 def draw_starts(runs: Sequence[Run], env: str, preset: str) -> bytes:
     """A PNG of success over each number of the start, the first `MOST_DRAWN` of them, one line per learner and guidance
     with Wilson's intervals of each quarter of its episodes; dotted, zero correction."""
@@ -81,30 +119,24 @@ def draw_starts(runs: Sequence[Run], env: str, preset: str) -> bytes:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    lines = [
-        (joined(tables), style, members, group)
-        for group, members in grouped(runs).items()
-        if group[:2] == (env, preset)
-        for tables, style in (([m.episodes for m in members], "-"), (zero_episodes(members), ":"))
-    ]
-    names = list(dict.fromkeys(n for episodes, *_ in lines for n in filter(_is_start, episodes) if bins(episodes, n)))
+    lines = _lines(runs, env, preset)
+    names = list(dict.fromkeys(n for line in lines for n in filter(_is_start, line.episodes) if bins(line.episodes, n)))
     count, names = len(names), names[:MOST_DRAWN]
     down = -(-max(len(names), 1) // ACROSS)
     figure, axes = pyplot.subplots(
         down, ACROSS, figsize=(13, 0.8 + 3.2 * down), layout="constrained", squeeze=False, sharey=True
     )
+    drawn: dict[str, Any] = {}
     for axis, name in zip(axes.flat, names, strict=False):
-        for episodes, style, members, group in lines:
-            parts = bins(episodes, name) if name in episodes else []
+        for line in lines:
+            parts = bins(line.episodes, name) if name in line.episodes else []
             if parts:
                 ends = np.array([wilson(hits, n) for _, _, n, hits in parts])
                 share = np.array([hits / n for _, _, n, hits in parts])
                 middle = [(low + high) / 2 for low, high, _, _ in parts]
-                what = "" if style == "-" else ", zero correction"
-                label = f"{shortened(group[2])}, guidance {shortened(group[3])} ({len(members)}){what}"
-                axis.errorbar(
-                    middle, share, (share - ends[:, 0], ends[:, 1] - share), linestyle=style, marker="o", markersize=3,
-                    capsize=2, color=COLOURS.get(group[2:4]), label=label,
+                drawn[line.label] = axis.errorbar(
+                    middle, share, (share - ends[:, 0], ends[:, 1] - share), linestyle=line.style, marker="o",
+                    markersize=3, capsize=2, color=line.colour, label=line.label,
                 )  # fmt: skip
         axis.set_xlabel(shortened(name.removeprefix(PREFIX).replace("_", " ")), parse_math=False)
         axis.set_ylim(-0.02, 1.02)
@@ -112,8 +144,8 @@ def draw_starts(runs: Sequence[Run], env: str, preset: str) -> bytes:
     for axis in axes.flat[len(names) :]:
         axis.set_axis_off()
     axes[0, 0].set_ylabel("success")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    for text in figure.legend(handles, labels, fontsize=8, loc="outside lower center", ncols=2).get_texts():
+    legend = figure.legend(list(drawn.values()), list(drawn), fontsize=8, loc="outside lower center", ncols=2)
+    for text in legend.get_texts():
         text.set_parse_math(False)
     title = f"{shortened(env)}, preset {shortened(preset)}: success in quarters of the episodes"
     title += f" (the first {MOST_DRAWN} of {count} numbers)" if count > MOST_DRAWN else ""

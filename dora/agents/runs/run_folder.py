@@ -18,7 +18,7 @@ from dora.agents.evaluation.evaluate import Evaluation
 from dora.agents.limits import check
 from dora.agents.runs.stored_results import MOST_RESULT, OF_TABLES, with_digests
 from dora.configs import plain
-from dora.digests import SEAL, check_file, check_text, is_whole, with_checksum
+from dora.digests import SEAL, check_file, check_text, file_sha256, is_whole, with_checksum
 from dora.errors import InputError
 from dora.files import check_name, renew_checksums, write_bytes, write_csv, write_json
 from dora.reading import read_json, read_text, read_yaml
@@ -243,8 +243,10 @@ class RunFolder:
             write_csv(self.path / "zero.csv", *zero.rows())
 
     def write_result(self, result: dict[str, Any]) -> dict[str, Any]:
-        """Write `result.json`, with digests of itself and of the tables in the folder; returns what it got."""
-        whole = with_digests(result, self.path)
+        """Write `result.json`, with digests of itself, of the tables in the folder and of the policy that was trained
+        in it; returns what it got."""
+        trained = {"policy_digest": file_sha256(self.best)} if self.best.is_file() else {}
+        whole = with_digests(result | trained, self.path)
         write_json(self.path / "result.json", whole)
         return whole
 

@@ -44,7 +44,8 @@ OPTIONAL = {
     "eval_episodes": "count", "total_steps": "count", "first_seed": "count or none", "task": "mapping",
     "other_load": "amount or none", "raw_success_rate": "share or none", "steps_to_80": "count or none",
     "stage_rates": "shares", "seed": "count", "task_config": "mapping or none", "learner_config": "mapping or none",
-    "training_config": "mapping or none",
+    "training_config": "mapping or none", "num_envs": "count or none", "workers": "count or none",
+    "policy_seed": "count or none", "policy_digest": "text or none",
     "overlap_share": "share", "config_digest": "text", OF_TABLES: "mapping", SEAL: "text",
 }  # fmt: skip
 """The same of entries that results of some versions have."""
@@ -166,12 +167,14 @@ def read_episodes(path: Path) -> dict[str, list[float]]:
     """Columns of an eval.csv or a zero.csv, a value for each episode.
 
     Raises:
-        InputError: it is too large, no table, has no row, lacks a column, or has a cell that is no number or a success
-            but 0 or 1.
+        InputError: it is too large, no table, has no row, lacks a column, has a cell that is no number or a success
+            but 0 or 1, or its episodes are not in their order: tables are compared row by row.
     """
     columns = _read_table(path, EPISODE_COLUMNS, MOST_EPISODES, all_columns=True)
     if not columns["success"]:
         raise _damaged(path, "it has no episode")
+    if columns["episode"] != list(range(len(columns["episode"]))):
+        raise _damaged(path, "its episodes are not 0, 1, 2, ... from line to line")
     if not all(value in (0.0, 1.0) for value in columns["success"]):
         raise _damaged(path, "success is not 0 or 1 everywhere")
     if unknown := [name for name, values in columns.items() if any(map(math.isnan, values))]:
