@@ -32,7 +32,9 @@ def largest_difference(ours: torch.nn.Module, theirs: torch.nn.Module) -> float:
 
 
 def test_ppo_in_plain_torch_takes_the_same_steps():
-    config = config_of("ppo", minibatch=48, prior=0.02, entropy=1e-2)
+    """With a pull and a ceiling of the noise that fall meanwhile; a batch has 128 transitions."""
+    schedules = {"prior": 0.05, "prior_last": 1e-3, "prior_steps": 600, "log_std_last": -1.5, "log_std_steps": 400}
+    config = config_of("ppo", minibatch=48, entropy=1e-2, **schedules)
     torch.manual_seed(0)
     ppo = PPO(config.learner, *SIZES, 1000)
     ppo.update(made_up_batch(config, *SIZES))
@@ -49,7 +51,9 @@ def test_ppo_in_plain_torch_takes_the_same_steps():
 
 
 def test_sac_in_plain_torch_takes_the_same_steps():
-    config = config_of("sac", warmup=64, critic_only=4, updates_per_step=1 / 8, batch=32, n_step=3)
+    """With a pull that falls meanwhile."""
+    pull = {"prior": 0.5, "prior_last": 1e-3, "prior_steps": 600}
+    config = config_of("sac", warmup=64, critic_only=4, updates_per_step=1 / 8, batch=32, n_step=3, **pull)
     torch.manual_seed(0)
     sac = SAC(config.learner, *SIZES, 1000)
     plain, first = PlainSAC(sac, *SIZES), copy.deepcopy(sac.actor)

@@ -48,6 +48,11 @@ class Breaking(PointMass):
         if what == "raise at the start" and parent_process() is not None:
             raise ValueError("one line\nanother line")
 
+    def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Tensor, dict[str, Any]]:
+        if options and self.what == "raise in a reset" and parent_process() is not None:
+            raise ValueError("one line\nanother line.")
+        return super().reset(seed, options)
+
     def step(self, action: Tensor) -> Any:
         self.steps += 1
         observation, reward, fail, truncated, info = super().step(action)
@@ -158,6 +163,7 @@ def test_a_worker_that_dies_leaves_a_run_that_goes_on(tmp_path: Path, ahead: boo
     ("what", "sentence"),
     [
         ("raise", r"Worker 0 failed with ValueError: one line\nanother line."),
+        ("raise in a reset", r"Worker 0 failed with ValueError: one line\nanother line."),
         ("raise at the start", r"Worker 0 failed with ValueError: one line\nanother line."),
         ("die at the start", "A worker process died while it started: worker 0 (ended by SIGKILL)."),
     ],

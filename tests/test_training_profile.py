@@ -99,6 +99,11 @@ def test_a_short_run_is_profiled_and_leaves_nothing(tmp_path: Path, monkeypatch:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_training_without_workers_is_refused():
+    with pytest.raises(InputError, match="workers is 0: give 1 or more"):
+        profile_training(replace(BASE, workers=0, learner=SMALL_PPO), PointMass, StepProfile, 512, 2)
+
+
 @pytest.mark.parametrize("steps", [511, training_profile.MOST_STEPS + 1])
 def test_too_few_and_too_many_steps_are_refused(steps: int):
     config = replace(BASE, workers=1, learner=SMALL_PPO)

@@ -42,7 +42,8 @@ class PPOConfig:
     entropy: float = 1e-3
     """Weight of the entropy bonus."""
     value: float = 1.0
-    """Weight of the value loss."""
+    """Weight of the value loss. It matters only where `grad_norm` cuts the critic's gradient: actor and critic share no
+    parameter, and Adam's steps do not depend on the scale of a loss."""
     bound: float = 5e-3
     """Weight of the penalty on mean actions outside [-1, 1]."""
     prior: float = 0.0

@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
+from jaxtyping import Bool
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.collectors import Collector, MultiSyncCollector
 
 from dora.agents.collecting.ray_collector import explained, ray_collector, whole_batch
@@ -65,6 +67,10 @@ class WorkerTaskEnv(TaskEnv):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         with _reported(self.report):
             return super()._reset(tensordict, **kwargs)
+
+    def _restart_rows(self, rows: Bool[Tensor, " n"]) -> TensorDictBase:
+        with _reported(self.report):
+            return super()._restart_rows(rows)
 
 
 @contextmanager

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 
 from dora.agents.config import PPOConfig, SACConfig
 from dora.agents.learners.networks import TANH_MARGIN, Critic, GaussianActor, Normaliser, TanhActor
-from dora.agents.learners.ppo import ADAM_EPSILON, PPO, adapted, excess, squared
+from dora.agents.learners.ppo import ADAM_EPSILON, PPO, adapted, excess, squared, standardised
 from dora.agents.learners.sac import ACTOR_PERIOD, SAC
+from dora.agents.learners.schedules import loudest, pull
 
 Batch = dict[str, Tensor]
 """Transitions (N, T, ...): observation, action, log_prob, reward, done, terminated, and next observation as `next`."""
@@ -42,12 +43,13 @@ class PlainPPO:
         self.actor, self.critic = GaussianActor(1, 1, (1,), 0.0), copy.deepcopy(ppo.critic)
         self.actor.mean, self.actor.log_std = copy.deepcopy(ppo.actor.mean), nn.Parameter(ppo.actor.log_std.clone())
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.learning_rate = ppo.learning_rate
+        self.learning_rate, self.steps = ppo.learning_rate, ppo.steps
         self.optimiser = torch.optim.Adam(parameters, lr=self.learning_rate, eps=ADAM_EPSILON, fused=True)
 
     def update(self, batch: Batch) -> int:
         """Learn from a batch (N, T); the number of gradient steps."""
         c, steps = self.config, 0
+        self.steps += batch["reward"].numel()
         features = self.normaliser(batch["observation"])
         with torch.no_grad():
             value, following = (self.critic(x)[..., 0] for x in (features, self.normaliser(batch["next"])))
@@ -83,8 +85,7 @@ class PlainPPO:
 
     def _step(self, part: Batch) -> Tensor:
         c = self.config
-        advantage = part["advantage"]
-        advantage = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
+        advantage = standardised(part["advantage"][:, None])[:, 0]
         mean, std = self.actor(part["features"])
         distribution = torch.distributions.Normal(mean, std)
         log_ratio = distribution.log_prob(part["action"]).sum(-1) - part["log_prob"]
@@ -92,14 +93,14 @@ class PlainPPO:
         gain = torch.minimum(ratio * advantage, ratio.clamp(1 - c.clip, 1 + c.clip) * advantage).mean()
         value_loss = c.value * nn.functional.mse_loss(self.critic(part["features"])[..., 0], part["target"])
         loss = -gain - c.entropy * distribution.entropy().sum(-1).mean() + value_loss
-        loss = loss + c.bound * excess(mean) + c.prior * squared(mean)
+        loss = loss + c.bound * excess(mean) + pull(c, self.steps) * squared(mean)
         self.optimiser.zero_grad()
         loss.backward()
         for net in (self.actor, self.critic):
             nn.utils.clip_grad_norm_(net.parameters(), c.grad_norm)
         self.optimiser.step()
         with torch.no_grad():
-            self.actor.log_std.clamp_(c.log_std_min, 0.0)
+            self.actor.log_std.clamp_(c.log_std_min, loudest(c, self.steps))
         return -log_ratio.detach().mean()
 
 
@@ -207,7 +208,7 @@ class PlainSAC:
         value = torch.minimum(*(critic(part["observation"], action) for critic in self.critics))[:, 0]
         for critic in self.critics:
             critic.requires_grad_(True)
-        pulled = self.config.prior * mean.square().sum(-1).mean()
+        pulled = pull(self.config, float(self.added)) * mean.square().sum(-1).mean()
         _descend(self.adams["actor"], (self.log_alpha.detach().exp() * log_prob - value).mean() + pulled)
         _descend(self.adams["alpha"], -(self.log_alpha * (log_prob.detach() + self.entropy)).mean())
 

@@ -157,8 +157,10 @@ def profile_training(
         cores: of the machine.
 
     Raises:
-        InputError: there are too few steps for one batch, too many, or no workers.
+        InputError: there are too few steps for two batches, too many, or no workers.
     """
+    if config.workers < 1:
+        raise InputError(f"workers is {config.workers}: give 1 or more, whose time is told beside the learner's.")
     batch = config.num_envs * config.workers * config.learner.rollout
     if not 2 * batch <= steps <= MOST_STEPS:
         raise InputError(f"--steps is {steps}: give a number from {2 * batch} (two batches) to {MOST_STEPS}.")

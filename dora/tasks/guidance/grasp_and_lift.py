@@ -101,7 +101,7 @@ class GraspReference(Reference):
         self.phase.reset(rows)
 
     def target(self, s: Snapshot) -> Target:
-        """The candidate's live goal less the standoff until the fingers close, then where the wrist was, raised.
+        """The candidate's live goal less the standoff until the fingers close, then where it was as they began, raised.
 
         World wrist pose [m], wxyz, and hand joints [rad] between the candidate's pre-grasp and grasp.
         """

@@ -89,6 +89,6 @@ class PenaltyWeights:
     effort: float = -0.05
     """Mean square of the action [1]."""
     change: float = -0.4
-    """Mean square of the action's change [1]."""
+    """A quarter of the mean square of the action's change [1]."""
     penetration: float = -1.0
     """Overlap beyond what is free [1]."""

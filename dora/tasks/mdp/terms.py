@@ -99,7 +99,7 @@ def penalties(weights: Any, free: float, limit: float, most: float = 1.0) -> dic
     """
     return {
         "effort": Term(effort, weights.effort, "penalty", doc="sum of action^2, over the number of its components"),
-        "change": Term(change, weights.change, "penalty", doc="mean square of the action's change"),
+        "change": Term(change, weights.change, "penalty", doc="a quarter of the mean square of the action's change"),
         "penetration": Term(
             overlap(free, most * limit), most * weights.penetration, "penalty",
             doc=f"overlap beyond {1000 * free:g} mm",
@@ -128,7 +128,7 @@ def paper_lift(stages: int, height: float) -> dict[str, Term[Any]]:
     def value(s: Snapshot) -> Tensor:
         return torch.exp(lifted(s).clamp(0, height) - height) * (s.stage >= stages)
 
-    return {"lift": Term(value, 1.0, doc="exp(z - z_0), saturating")}
+    return {"lift": Term(value, 1.0, doc=f"exp(z - z_0 - h), z - z_0 between 0 and h = {height:g} m")}
 
 
 def paper_penalty() -> dict[str, Term[Any]]:
