@@ -35,7 +35,11 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     ("which", "place", "name"),
     [
         ("policy", ENV, "policy"),
-        ("runs/a.b/best.safetensors", Path("runs/a.b/best.safetensors"), "best"),
+        ("runs/a.b/best.safetensors", Path("runs/a.b/best.safetensors"), "a.b"),
+        ("runs/lift0.12/checkpoints/best.safetensors", Path("runs/lift0.12/checkpoints/best.safetensors"), "lift0.12"),
+        ("results/sac-s10/policy.safetensors", Path("results/sac-s10/policy.safetensors"), "sac-s10"),
+        ("policy/policy.safetensors", Path("policy/policy.safetensors"), "own-policy"),
+        ("lift0.15.safetensors", Path("lift0.15.safetensors"), "lift0.15"),
         ("runs/new", Path("runs/new"), "new"),
     ],
 )
@@ -47,6 +51,12 @@ def test_a_policy_is_found_by_its_task_or_its_path(asked: list[Any], which: str,
     assert find_source(ENV, which, "none").options["preset"] == "none"
     with pytest.raises(InputError, match=f"{which} is a policy of {ENV}, not of DoraJug-v1"):
         find_source("DoraJug-v1", which)
+
+
+def test_a_run_folder_gives_its_name_with_all_its_dots(asked: list[Any], tmp_path: Path):
+    for name in ("lift0.12", "lift0.15"):
+        (tmp_path / name).mkdir()
+        assert find_source(ENV, str(tmp_path / name)).name == name
 
 
 @pytest.mark.parametrize(("preset", "kept"), [(None, "standard"), ("hard", "hard")])

@@ -9,8 +9,10 @@ from pictures import run_without_driver
 from PIL import Image, ImageSequence
 
 from dora.agents.config import RunConfig
+from dora.agents.evaluation.play import write_film
 from dora.commands import run
 from dora.errors import InputError
+from dora.files import film_is_whole
 from dora.policies.films import MOMENTS, RATE, SIDE, Episode, _small, as_gif, strip
 from dora.tools.stage_pictures import GAP
 
@@ -36,6 +38,23 @@ def test_a_film_has_the_pictures_of_all_episodes_at_its_rate():
     assert frames[0].shape == (SIDE, SIDE, 3)
     assert frames[5][60, 2 * 10 + 20].min() > 200
     assert frames[5][60, 150].max() < 50
+
+
+@pytest.mark.parametrize(("rate", "kept"), [(20, 40), (40, 20), (50, 40)])
+def test_a_gif_takes_as_long_as_the_episode_and_begins_again(tmp_path: Path, rate: int, kept: int):
+    """Its frames last multiples of 10 ms: of 40 pictures a second it has every second one."""
+    frames = [np.full((16, 16, 3), 5 * k, np.uint8) for k in range(40)]
+    write_film(tmp_path / "a.gif", [frames], rate)
+    film = Image.open(tmp_path / "a.gif")
+    lasting = [frame.info["duration"] for frame in ImageSequence.Iterator(film)]
+    assert (len(lasting), sum(lasting), film.info["loop"]) == (kept, 40 * 1000 / rate, 0)
+
+
+def test_a_film_may_have_a_colon_in_its_relative_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """FFmpeg would take what stands before it as a protocol."""
+    monkeypatch.chdir(tmp_path)
+    write_film(Path("run:1", "a:b.mp4"), [[np.zeros((16, 16, 3), np.uint8)] * 4], 20)
+    assert film_is_whole(tmp_path / "run:1" / "a:b.mp4", 4, 20)
 
 
 def test_a_strip_shows_the_moments_in_which_something_happens():

@@ -80,7 +80,7 @@ def test_a_slider_asks_for_its_share_of_the_range(value: float, share: float):
 
 def test_sliders_follow_a_start_unless_a_person_has_asked_for_it():
     shown = Shown(state())
-    x, turn = shown.panel.sliders
+    x, turn = shown.panel.sliders.values()
     shown.asked("x [m]", 1.0)
     shown.asked("x [m]", 2.0)
     shown.panel.update(state(shares=(0.5, 0.5)))  # the answer to the first one
@@ -127,16 +127,28 @@ def test_the_button_says_what_it_would_do():
 
 def test_another_environment_has_other_sliders_and_candidates():
     shown = Shown(state())
-    old = list(shown.panel.sliders)
+    old = list(shown.panel.sliders.values())
     numbers = (StartNumber("height", "m", 0.1234, 0.5678), StartNumber("far", "m", 0.0, 3.0))
     setup = replace(SETUP, numbers=numbers, candidates=())
     shown.panel.update(state(setup=setup, shares=(0.0, 0.33333333)))
     assert all(slider.removed for slider in old)
-    assert [slider.value for slider in shown.panel.sliders] == [0.1234, 1.0]
+    assert [slider.value for slider in shown.panel.sliders.values()] == [0.1234, 1.0]
     assert shown.found["candidate"].options == (NEAREST,)
     assert not shown.found["candidate"].visible
     shown.panel.update(state(setup=setup, shares=(1.0, 0.12345678)))
-    assert [slider.value for slider in shown.panel.sliders] == [0.5678, 0.37]
+    assert [slider.value for slider in shown.panel.sliders.values()] == [0.5678, 0.37]
     shown.panel.update(state(setup=replace(setup, numbers=()), shares=()))
-    assert shown.panel.sliders == []
+    assert shown.panel.sliders == {}
+    assert not shown.found["Start"].visible
+
+
+def test_a_number_with_a_single_value_has_no_slider():
+    """Such as the place of a cube that always stands in the same one."""
+    numbers = (StartNumber("x", "m", 0.5, 0.5), StartNumber("yaw", "rad", 0.0, 4.0))
+    shown = Shown(state(setup=replace(SETUP, numbers=numbers), shares=(0.0, 0.25)))
+    assert list(shown.panel.sliders) == [1]
+    assert shown.asked("yaw [rad]", 3.0) == [Start((0.0, 0.75))]
+    shown.panel.update(state(setup=replace(SETUP, numbers=numbers), shares=(0.0, 0.5)))
+    assert shown.panel.sliders[1].value == 2.0
+    shown.panel.update(state(setup=replace(SETUP, numbers=numbers[:1]), shares=(0.0,)))
     assert not shown.found["Start"].visible

@@ -144,6 +144,16 @@ def test_any_change_of_a_recording_of_ours_is_found(recording: Path, tmp_path: P
         Recording.open(copy)
 
 
+def test_a_recording_may_be_renamed_and_is_checked_all_the_same(recording: Path, tmp_path: Path):
+    for end in (".h5", ".json", ".sha256"):
+        shutil.copy(recording.with_suffix(end), tmp_path / f"a cube{end}")
+    copy = tmp_path / "a cube.h5"
+    assert len(Recording.open(copy).episode(0).actions)
+    copy.with_suffix(".json").write_text(copy.with_suffix(".json").read_text() + " ")
+    with pytest.raises(InputError, match=r"a cube\.json is not as it was written"):
+        Recording.open(copy)
+
+
 def test_recordings_that_maniskill_joined_can_be_played(recording: Path, tmp_path: Path):
     merge_trajectories(str(tmp_path / "merged.h5"), [str(recording), str(recording)])
     merged = Recording.open(tmp_path / "merged.h5")

@@ -241,6 +241,21 @@ def test_the_speed_has_bounds_and_holds_from_now_on(asked: float, kept: float):
     assert counted.session.turn()
 
 
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_orders_with_numbers_that_are_not_finite_change_nothing(number: float):
+    """A page's client may send any number."""
+    counted = Counted()
+    speed = counted.session.state.speed
+    for order, words in (
+        (Speed(number), "The speed is"),
+        (Push(number, 0.0), "The push is"),
+        (Push(1.0, number), "The push is"),
+    ):
+        assert words in (counted.do(order).message or "")
+    assert counted.session.state.speed == speed
+    assert counted.task.pushes == []
+
+
 def test_a_push_has_its_direction():
     counted = Counted()
     counted.do(Push(2.0, math.pi / 6))

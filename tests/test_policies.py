@@ -70,6 +70,17 @@ def test_arrays_and_tensors_single_and_batched_give_the_same_actions(env_id: str
     assert np.array_equal(policy(batch), actions), "it is greedy"
 
 
+@pytest.mark.filterwarnings("error")
+def test_arrays_may_be_views_of_others_and_read_only() -> None:
+    env_id = bundled_ids()[0]
+    policy, batch = dora.load_policy(env_id), observation(env_id)
+    actions = policy(batch)
+    batch.flags.writeable = False
+    assert np.array_equal(policy(batch), actions)
+    np.testing.assert_allclose(policy(batch[::-1]), actions[::-1], atol=1e-5)
+    assert np.array_equal(policy(np.asfortranarray(batch)), actions)
+
+
 def test_the_action_is_that_of_evaluation_clipped() -> None:
     """Of PPO, whose mean action has no bounds."""
     path = RESULTS / "DoraCube-v1" / "ppo-affordance-s10" / "policy.safetensors"

@@ -67,6 +67,14 @@ def test_nothing_is_said_of_other_starts_or_settings(row: tuple[Path, Path, RunC
     assert agreement(policy, table, config, seed) is None
 
 
+def test_damaged_figures_beside_a_policy_are_told_and_end_nothing(row: tuple[Path, Path, RunConfig, int]):
+    folder, table, config, seed = row
+    path = folder / "result.json"
+    path.write_text(path.read_text().replace('"success_rate": 0.', '"success_rate": 0.1'))
+    said = agreement(folder / "policy.safetensors", table, config, seed) or ""
+    assert said.startswith(f"Not compared with the run of its policy: {path} is damaged")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_a_stored_run_is_evaluated_again_as_it_was(

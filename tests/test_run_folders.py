@@ -90,7 +90,7 @@ def test_weights_that_are_not_finite_are_refused_with_their_file(tmp_path: Path)
 def test_only_one_process_trains_in_a_folder(tmp_path: Path):
     folder = RunFolder(tmp_path)
     folder.create(SHORT)
-    with folder.locked(), pytest.raises(InputError, match="Another process is training in"), folder.locked():
+    with folder.locked(), pytest.raises(InputError, match="Another process is at work in"), folder.locked():
         pass
     holder = (
         "import sys, time; from pathlib import Path; from dora.agents.runs.run_folder import RunFolder\n"

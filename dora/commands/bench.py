@@ -84,20 +84,25 @@ def bench_learner(env: str = "DoraCube-v1", agent: str = "ppo", seconds: float =
     report(dataclasses.asdict(speed), json)
 
 
-def bench_training(env: str = "DoraCube-v1", agent: str | None = None, steps: int = 50_000, json: bool = False) -> None:
+def bench_training(
+    env: str = "DoraCube-v1", agent: str | None = None, steps: int | None = None, json: bool = False
+) -> None:
     """Where the time of a training goes, with a task's recommended settings: a short run, which is thrown away.
 
     Args:
         env: a Dora id.
         agent: learner (default: the task's recommended one).
-        steps: environment steps; a run evaluates every 25,000 to 50,000 of them.
+        steps: environment steps (default: 50,000, or up to the first evaluation where the task's comes later).
         json: print one JSON object on the last line instead of a table.
     """
     config = recommended(env, agent, find_task(env).LEARNERS)
     make_tasks = functools.partial(make_task, env, **config.task_options)
+    steps = max(SHORT_TRAINING, config.eval_every) if steps is None else steps
     report(dataclasses.asdict(profile_training(config, make_tasks, StepProfile, steps, available_cores())), json)
 
 
+SHORT_TRAINING = 50_000
+"""Fewest environment steps of a training that is profiled, where nothing else is said [1]."""
 PHYSICS = ("120:10:8", "240:2:8", "240:3:6", "240:5:4", "240:5:8", "240:10:4", "240:10:8", "240:10:15", "480:10:8")
 """Default physics settings: rate [Hz], contact offset [mm], position iterations."""
 

@@ -69,7 +69,7 @@ class Args:
     object: str | None = None
     """Name of an object in objects/ or in a folder of DORA_OBJECTS, or the path of an object's folder or mesh."""
     mesh: Path | None = None
-    """Your own mesh: OBJ, STL, PLY or GLB, closed or nearly so."""
+    """Your own mesh: OBJ, STL, PLY, GLB, glTF, OFF or 3MF, closed or nearly so."""
     labels: Path | None = None
     """Regions of --mesh: a file with one label per face, or a YAML of boxes and planes (docs/objects.md in
     the project)."""

@@ -12,7 +12,6 @@ an option; the defaults that are shown are those of the task that --env names.
 """
 
 import contextlib
-import datetime
 import difflib
 import functools
 import logging
@@ -35,7 +34,7 @@ from dora.agents.runs.agreement import agreement
 from dora.agents.runs.interrupt import STATUS, ending_at_once
 from dora.agents.runs.logging import add_film
 from dora.agents.runs.recommended import learners_of, recommended
-from dora.agents.runs.run_folder import RunFolder, make_result
+from dora.agents.runs.run_folder import RunFolder, default_folder, make_result
 from dora.agents.runs.stored_results import read_result
 from dora.agents.runs.trainer import Trainer
 from dora.configs import plain
@@ -137,6 +136,8 @@ def parse(words: Sequence[str]) -> Args[dict[str, Any], Any, str]:
     if config.final_episodes != base.final_episodes:
         check_episodes(config.final_episodes)
     refuse_settings_of_training(base, config)
+    if first.agent is not None and args.checkpoint is None:
+        raise InputError("--agent has no effect on an evaluation of zero correction: leave it out.")
     if args.collector != default.collector:
         raise InputError("--collector has no effect on an evaluation: leave it out.")
     if args.zero_correction and not config.has_prior:
@@ -267,12 +268,6 @@ def refuse_finished(folder: Path, total_steps: int) -> None:
         )
 
 
-def default_folder(config: RunConfig, agent: str, suffix: str = "") -> Path:
-    """runs/<env>/<agent>-<guidance>-s<seed>-<time>."""
-    time = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    return Path("runs") / config.env / f"{agent}-{config.guidance}-s{config.seed}-{time}{suffix}"
-
-
 def task_maker(config: RunConfig) -> Any:
     """Makes a batch of the run's task from the number of environments; can be sent to other processes."""
     return functools.partial(make_task, config.env, **config.task_options)
@@ -293,7 +288,12 @@ def train(args: Args) -> tuple[Path, int]:
         folder.create(config)
     with folder.locked():
         options: Any = {"zero": args.zero_correction, "cluster": args.collector == "ray"}
-        trainer = Trainer(config, task_maker(config), folder, resume=args.resume is not None, **options)
+        try:
+            trainer = Trainer(config, task_maker(config), folder, resume=args.resume is not None, **options)
+        except InputError:
+            if args.resume is None:
+                folder.discard()
+            raise
         folder.write_config(config)  # a larger budget, once it is known that the run can go on
         go_on = "To go on: " + shlex.join([*started_as(sys.orig_argv, sys.argv), "--resume", str(folder.path)])
         try:
@@ -330,33 +330,35 @@ def evaluate_only(args: Args) -> Path:
     path = None if args.checkpoint is None else checkpoint_path(args.checkpoint)
     agent = ZERO if path is None else config.agent
     folder = RunFolder(args.out or default_folder(config, agent, "-eval"))
-    folder.check_free()
+    folder.check_free(evaluation=True)
     os.environ[RECORDS] = str(folder.nonfinite.absolute())  # processes that are started later see it, too
     progress: dict[str, Any] = {"env_steps": 0, "wall_seconds": 0.0, "episodes": 0, "curve": []}
     policy = dict[str, Any]()
 
     def begin() -> None:
         folder.create(config, evaluation=True)
+        held.enter_context(folder.locked())
         if args.video:
             film(path, config, folder.video / ("best.mp4" if path else "zero.mp4"), args.first_seed)
         print(f"evaluation on {config.final_episodes} episodes ...", file=sys.stderr)
 
     settings = config, task_maker(config)
-    if path is None:
-        begin()
-        evaluation = zero = evaluate_zero(*settings, args.first_seed)
-        print(f"without any correction: {outcome(evaluation, None)}", file=sys.stderr)
-    else:
-        options: Any = {"zero": args.zero_correction, "first_seed": args.first_seed, "before": begin}
-        checkpoint, evaluation, zero = evaluate_checkpoint(path, *settings, **options)
-        progress = {name: checkpoint.progress.get(name, value) for name, value in progress.items()}
-        policy = {"policy_seed": checkpoint.config.seed, "policy_digest": file_sha256(path)}  # `seed` may be another
-        print(outcome(evaluation, zero), file=sys.stderr)
-    folder.write_evaluation(evaluation, zero if path else None)
+    with contextlib.ExitStack() as held:
+        if path is None:
+            begin()
+            evaluation = zero = evaluate_zero(*settings, args.first_seed)
+            print(f"without any correction: {outcome(evaluation, None)}", file=sys.stderr)
+        else:
+            options: Any = {"zero": args.zero_correction, "first_seed": args.first_seed, "before": begin}
+            checkpoint, evaluation, zero = evaluate_checkpoint(path, *settings, **options)
+            progress = {name: checkpoint.progress.get(name, value) for name, value in progress.items()}
+            policy = {"policy_seed": checkpoint.config.seed, "policy_digest": file_sha256(path)}  # `seed` may differ
+            print(outcome(evaluation, zero), file=sys.stderr)
+        folder.write_evaluation(evaluation, zero if path else None)
+        result = make_result(config, evaluation=evaluation, zero=zero, finished=True, commit=commit, **progress)
+        folder.write_result(result | policy | {"agent": agent, "checkpoint": None if path is None else str(path)})
     if path is not None and (said := agreement(path, folder.path / "eval.csv", config, args.first_seed)):
         print(said, file=sys.stderr)
-    result = make_result(config, evaluation=evaluation, zero=zero, finished=True, commit=commit, **progress)
-    folder.write_result(result | policy | {"agent": agent, "checkpoint": None if path is None else str(path)})
     return folder.path
 
 

@@ -83,7 +83,7 @@ def main() -> int:
     sweep = Sweep(rows, out, args.known, args.jobs, args.retries)
     if args.dry_run:
         print_all(sweep)
-        print(f"{summary(sweep)} with {args.jobs} at a time.")
+        print(f"{summary(sweep)} with {args.jobs or 'as many as there is room for'} at a time.")
         return 0
     with Interrupt() as interrupt:
         try:

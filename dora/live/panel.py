@@ -49,7 +49,7 @@ class Panel:
             self.preset = gui.add_dropdown("randomisation", tuple(PRESETS), initial_value=state.preset)
             self.candidate = gui.add_dropdown("candidate", (NEAREST,), initial_value=NEAREST)
         self._start_folder = gui.add_folder("Start")
-        self.sliders: list[Any] = []
+        self.sliders: dict[int, Any] = {}
         with gui.add_folder("Push"):
             self.push = gui.add_button("Push the object")
             self.impulse = gui.add_slider("impulse [N s]", 0.0, STRONGEST, 0.01, MIDDLE)
@@ -85,7 +85,7 @@ class Panel:
         """Asks for the start with the number of slider k, if a person has moved it."""
         n, value = self._told.setup.numbers[k], self.sliders[k].value
         if abs(value - _value(self._told, k)) > SAME * (n.high - n.low):
-            self._wanted[k] = min(max((value - n.low) / (n.high - n.low), 0.0), 1.0)
+            self._wanted[k] = min(max(n.share_of(value), 0.0), 1.0)
             shares = tuple(self._wanted)
             self._asked.add(shares)
             self._order(Start(shares))
@@ -93,17 +93,18 @@ class Panel:
     def _rebuild(self, state: LiveState) -> None:
         """Sliders and choices of another environment."""
         self._told = state
-        for slider in self.sliders:
+        for slider in self.sliders.values():
             slider.remove()
-        self.sliders = []
+        self.sliders = {}
+        free = [(k, n) for k, n in enumerate(state.setup.numbers) if n.free]
         with self._start_folder:
-            for k, n in enumerate(state.setup.numbers):
+            for k, n in free:
                 step = (n.high - n.low) / SLIDER_STEPS
                 slider = self._gui.add_slider(f"{n.name} [{n.unit}]", n.low, n.high, step, _value(state, k))
                 slider.on_update(lambda _, k=k: self._place(k))
-                self.sliders.append(slider)
+                self.sliders[k] = slider
         self._wanted, self._asked = list(state.episode.shares), set[tuple[float, ...]]()
-        self._start_folder.visible = bool(state.setup.numbers)
+        self._start_folder.visible = bool(free)
         self.candidate.options = (NEAREST, *state.setup.candidates)
         self.candidate.visible = bool(state.setup.candidates)
 
@@ -126,7 +127,7 @@ class Panel:
         moved = state.episode.shares != told.episode.shares and state.episode.shares not in self._asked
         if refused or moved:  # a slider that a person is moving stays where it is
             self._wanted, self._asked = list(state.episode.shares), set()
-            for k, slider in enumerate(self.sliders):
+            for k, slider in self.sliders.items():
                 slider.value = _value(state, k)
         label = "Pause" if state.running else "Run"
         if self.pause.label != label:

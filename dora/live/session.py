@@ -202,6 +202,8 @@ class Session:
         self._running, self._steps_left, self._due = False, min(max(order.count, 0), MOST_STEPS), self.clock()
 
     def _set_speed(self, order: Speed) -> None:
+        if not math.isfinite(order.speed):
+            raise InputError(f"The speed is {order.speed}: give a number.")
         self._speed = min(max(order.speed, SLOWEST), FASTEST)
         self._due = self.clock()
 
@@ -233,6 +235,8 @@ class Session:
         self._change(candidate=order.candidate)
 
     def _push(self, order: Push) -> None:
+        if not (math.isfinite(order.impulse) and math.isfinite(order.direction)):
+            raise InputError(f"The push is {order.impulse} N s towards {order.direction} rad: give finite numbers.")
         self._task.push(order.impulse * math.cos(order.direction), order.impulse * math.sin(order.direction))
 
     def _refuse_recording(self, what: str) -> None:

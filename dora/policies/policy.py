@@ -139,7 +139,7 @@ class TaskPolicy:
                 f'first, of an environment made with obs_mode="state"; {self._remedy()}'
             )
         try:
-            values = obs if isinstance(obs, Tensor) else torch.from_numpy(np.asarray(obs, np.float32))
+            values = obs if isinstance(obs, Tensor) else torch.from_numpy(np.array(obs, np.float32, order="C"))
         except (TypeError, ValueError) as error:
             raise InputError(
                 f"the observation of a policy has to be an array of numbers, not {shown(obs)}; {self._remedy()}"

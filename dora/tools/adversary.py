@@ -18,9 +18,10 @@ import gymnasium as gym
 import torch
 import tyro
 from jaxtyping import Float
+from mani_skill.utils.registration import REGISTERED_ENVS
 from torch import Tensor
 
-from dora.errors import command
+from dora.errors import InputError, command, suggestion
 from dora.progress import ProgressDisplay
 from dora.sim import BACKEND
 from dora.tasks import task_ids
@@ -142,6 +143,10 @@ class Args:
 def main() -> int:
     """Run the command; returns the exit status."""
     args, good = tyro.cli(Args, description=__doc__), True
+    for name in args.envs:
+        if name not in REGISTERED_ENVS:
+            hint = suggestion(name, REGISTERED_ENVS, "name one of Dora or ManiSkill.")
+            raise InputError(f"There is no task {name!r}: {hint}")
     for name in args.envs:
         options: Any = {"num_envs": args.num_envs, "sim_backend": BACKEND, "render_backend": "none"}
         env: Any = gym.make(name, obs_mode="state", **options).unwrapped

@@ -13,10 +13,12 @@ from typing import Any, Generic, Literal, TypeVar
 import tyro
 
 from dora.errors import InputError, command
-from dora.tasks import find_task, make_task
+from dora.tasks import find_task, make_task, task_ids
 from dora.tasks.env.options import task_config
-from dora.tools.command_line import read_some
+from dora.tools.command_line import HELP, read_some
 
+SHOWN = "DoraJug-v1"
+"""Task whose options `--help` shows if none is named."""
 Numbers = TypeVar("Numbers")
 """Numbers of the task that is named."""
 
@@ -44,13 +46,15 @@ class First:
 
 @command
 def main(argv: Sequence[str] | None = None) -> int:
-    """Prints the tables of the task that is named first; returns the exit status."""
+    """Prints the tables of the task that is named; returns the exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
-    if not words or words[0].startswith("-"):
+    otherwise = SHOWN if HELP & set(words) else words[0] if words else "-"
+    named = next((word for word in words if word in task_ids()), otherwise)
+    if named.startswith("-"):
         raise InputError("Say which task, for example: python -m dora.tools.describe DoraJug-v1")
-    cls, preset = find_task(words[0]).CONFIG, read_some(First, words).preset
+    cls, preset = find_task(named).CONFIG, read_some(First, words).preset
     form: Any = Args[cls]
-    default = Args(env=words[0], task=task_config(cls, preset, None))
+    default = Args(env=named, task=task_config(cls, preset, None))
     args: Args = tyro.cli(form, default=default, description=__doc__, args=words)
     options = {"guidance": args.guidance, "preset": args.preset, "config": args.task}
     task = make_task(args.env, 1, sim_backend="physx_cpu", **options)

@@ -12,6 +12,7 @@ import mani_skill.envs  # noqa: F401  (registers the tasks)
 import numpy as np
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
 import dora  # noqa: F401  (registers Dora's tasks)
@@ -83,8 +84,8 @@ def measure(env_id: str, num_envs: int, workers: int, seconds: float, obs_mode: 
         if not 0 < value <= MOST[name]:
             option = name.replace("_", "-")
             raise InputError(f"--{option} is {value}: it must be positive, and at most {MOST[name]}.")
-    if env_id not in gym.registry:
-        hint = suggestion(env_id, gym.registry, "see gymnasium.registry for the ids.")
+    if env_id not in REGISTERED_ENVS:
+        hint = suggestion(env_id, REGISTERED_ENVS, "see mani_skill.utils.registration.REGISTERED_ENVS for the ids.")
         raise InputError(f"there is no task {env_id!r}: {hint}")
     if wants_pictures(obs_mode) and not can_render():
         refuse_pictures(obs_mode, None)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from dora.errors import InputError
+from dora.errors import InputError, shown
 from dora.sim.grasp_tests.test_scene import Physics
 from dora.tasks import find_task, make_task
 from dora.tasks.mdp.randomisation import find_preset
@@ -49,8 +49,8 @@ def parse_physics(text: str) -> Physics:
     try:
         frequency, offset, iterations = text.split(":")
         numbers = float(int(frequency)), int(iterations), float(offset) / 1000
-    except ValueError:
-        raise InputError(f"{text!r} is not FREQUENCY:OFFSET_MM:ITERATIONS, such as 240:10:8") from None
+    except (ValueError, OverflowError):
+        raise InputError(f"{shown(text)} is not FREQUENCY:OFFSET_MM:ITERATIONS, such as 240:10:8") from None
     for number, most, what in zip(numbers, (MOST_RATE, MOST_ITERATIONS, MOST_OFFSET), WHAT, strict=True):
         if not 0 < number <= most:
             raise InputError(f"{text!r} has the {what} {number:g}, which has to be above 0 and at most {most:g}")

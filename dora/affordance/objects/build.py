@@ -36,7 +36,7 @@ class Args:
     folders: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Folders to write, named as the objects (default: all models, into objects/)."""
     mesh: Path | None = None
-    """Your own mesh instead of a model: OBJ, STL, PLY or GLB, closed or nearly so."""
+    """Your own mesh instead of a model: OBJ, STL, PLY, GLB, glTF, OFF or 3MF, closed or nearly so."""
     labels: Path | None = None
     """Regions of --mesh: a file with one label per face, or a YAML of boxes and planes (docs/objects.md in
     the project)."""

@@ -46,7 +46,8 @@ def start_server(host: str, port: int, label: str) -> Any:
 
 def address(server: Any) -> str:
     """Address of the page of a running server."""
-    return f"http://{server.get_host()}:{server.get_port()}"
+    host = server.get_host()
+    return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
 
 
 def legend_html(title: str, table: Mapping[str, tuple[int, int, int]]) -> str:

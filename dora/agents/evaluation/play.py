@@ -25,6 +25,8 @@ from dora.files import film_is_whole
 
 FILMS = (".mp4", ".mov", ".avi", ".mkv", ".wmv", ".gif")
 """Suffixes of films that can be written."""
+GIF_TICKS, MOST_LEFT_OUT = 100, 10
+"""Ticks per second in which a GIF counts, and frames of a film of which it must have one [1]."""
 FRAMES_PER_SECOND = 20
 """Rate of a film of a task that does not say its control frequency [Hz]."""
 
@@ -136,20 +138,24 @@ def record(
 
 
 def write_film(path: Path, episodes: Iterable[Sequence[UInt8[np.ndarray, "h w 3"]]], rate: float | int) -> None:
-    """Write the frames of episodes, one after the other, as a film with so many frames per second [Hz].
+    """Write the frames of episodes, one after the other, as a film with so many frames per second [Hz]; as a GIF, whose
+    frames last multiples of 10 ms, every frame of which that can be said.
 
     Raises:
         InputError: it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside, count = path.with_name(f".{os.getpid()}-{path.name}"), 0
+    beside, count = path.absolute().with_name(f".{os.getpid()}-{path.name}"), 0  # FFmpeg takes "a:b" as a protocol
+    gif = path.suffix.lower() == ".gif"
+    every = next((n for n in range(1, MOST_LEFT_OUT) if (n * GIF_TICKS / rate).is_integer()), 1) if gif else 1
+    options: dict[str, Any] = {"loop": 0} if gif else {"macro_block_size": 8}
     try:
-        with imageio.get_writer(beside, fps=rate, macro_block_size=8) as writer:
+        with imageio.get_writer(beside, fps=rate / every, **options) as writer:
             for frames in episodes:
-                for frame in frames:
+                for frame in frames[::every]:
                     writer.append_data(frame)  # pyright: ignore[reportAttributeAccessIssue]
                 count += len(frames)
-        if path.suffix.lower() != ".gif" and not film_is_whole(beside, count, rate):
+        if not gif and not film_is_whole(beside, count, rate):
             raise OSError("the encoder did not end well")
         os.replace(beside, path)
     except OSError as error:

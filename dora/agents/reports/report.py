@@ -7,7 +7,7 @@ from statistics import mean, stdev
 from urllib.parse import quote
 
 from dora.agents.reports.comparison import sections
-from dora.agents.reports.figures import draw_curves, draw_overlap
+from dora.agents.reports.figures import draw_curves, draw_overlap, shortened
 from dora.agents.reports.physics import apart, physics_section
 from dora.agents.reports.run_results import (
     ALONE,
@@ -156,7 +156,7 @@ def write_report(roots: Path | Sequence[Path], out: Path, rules: Mapping[str, in
     texts = {
         "tables.md": f"{tables(runs)}\n{NOTE}\n",
         "comparison.md": "\n".join(map(_markdown, compared)),
-        "report.html": html_page(PAGE, root=" and ".join(root.name for root in several(roots)), **shown),
+        "report.html": html_page(PAGE, root=" and ".join(shortened(root.name) for root in several(roots)), **shown),
     }
     contents = {name: text.encode() for name, text in texts.items()} | figures
     make_folder(out)  # everything has been read and drawn

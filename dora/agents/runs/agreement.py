@@ -6,6 +6,7 @@ from pathlib import Path
 
 from dora.agents.config import RunConfig
 from dora.agents.runs.stored_results import read_episodes, read_result
+from dora.errors import InputError
 
 COMPARED = ("success", "return", "penetration_mm")
 """Columns that have to be the same for an episode to be."""
@@ -23,11 +24,16 @@ def agreement(checkpoint: Path, evaluated: Path, config: RunConfig, first_seed: 
         first_seed: seed of its first episode.
 
     Returns:
-        The sentence; None if there are no figures, or they are of other starts or settings.
-
-    Raises:
-        InputError: the figures are damaged.
+        The sentence, which says so where the figures are damaged; None if there are none, or they are of other starts
+        or settings.
     """
+    try:
+        return _agreement(checkpoint, evaluated, config, first_seed)
+    except InputError as error:
+        return f"Not compared with the run of its policy: {error}"
+
+
+def _agreement(checkpoint: Path, evaluated: Path, config: RunConfig, first_seed: int) -> str | None:
     best = Path(checkpoint.parent.name, checkpoint.name) == BEST
     folder = checkpoint.parent.parent if best else checkpoint.parent
     if not all(os.path.isfile(folder / name) for name in ("result.json", "eval.csv")):

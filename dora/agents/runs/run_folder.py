@@ -2,8 +2,10 @@
 
 import contextlib
 import dataclasses
+import datetime
 import fcntl
 import importlib.metadata
+import itertools
 import os
 import platform
 import re
@@ -28,6 +30,8 @@ PACKAGES = ("mani_skill", "sapien", "torch", "torchrl", "tensordict", "gymnasium
 """Packages whose versions are written besides that of Dora."""
 EVALUATION = "evaluation.txt"
 """File of a folder in which a policy is only evaluated."""
+VERSIONS, LOCK = "versions.txt", ".lock"
+"""Files of the versions of packages, and of the process that works in the folder."""
 OWN_FILES = (EVALUATION, "config.yaml", "result.json", "curve.csv", "eval.csv", "zero.csv", "progress.csv",
              "checkpoints/latest.safetensors", "checkpoints/best.safetensors")  # fmt: skip
 """Files by which a folder is known to hold a run."""
@@ -106,8 +110,11 @@ class RunFolder:
             )
         return False
 
-    def check_free(self) -> None:
+    def check_free(self, evaluation: bool = False) -> None:
         """Refuse a folder in which no run can be begun, before any work.
+
+        Args:
+            evaluation: the run is an evaluation, which may take the place of one that ended before its result.
 
         Raises:
             InputError: if it holds a run already, or cannot be made or written.
@@ -119,6 +126,8 @@ class RunFolder:
             fits = above.is_dir() and os.access(above, os.W_OK | os.X_OK)
         except (OSError, ValueError) as error:
             raise InputError(f"Cannot make the run folder {self.path} ({error}): choose another --out.") from error
+        if evaluation and EVALUATION in found and "result.json" not in found:
+            found = []
         if found and self.is_evaluation():
             raise InputError(f"{self.path} holds an evaluation already ({found[0]}): choose another --out.")
         if found:
@@ -151,23 +160,33 @@ class RunFolder:
         """Make the folder and write `config.yaml` and `versions.txt`, and before them what tells an evaluation.
 
         Raises:
-            InputError: if it cannot be written or holds a run already.
+            InputError: if it cannot be written or holds a run already, or another process begins one there.
         """
-        self.check_free()
+        self.check_free(evaluation)
         try:
             self.checkpoints.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(
                 f"Cannot make the run folder {self.path} ({error.strerror}): choose another --out."
             ) from error
-        if evaluation:
-            write_bytes(self.path / EVALUATION, b"A policy is evaluated here, nothing is trained.\n")
-        self.write_config(config)
-        write_bytes(self.path / "versions.txt", _versions().encode())
+        with self.locked():
+            self.check_free(evaluation)  # of two processes one is first
+            if evaluation:
+                write_bytes(self.path / EVALUATION, b"A policy is evaluated here, nothing is trained.\n")
+            self.write_config(config)
+            write_bytes(self.path / VERSIONS, _versions().encode())
+
+    def discard(self) -> None:
+        """Remove what `create` made, and the folder if nothing else is in it: no run can begin with its settings."""
+        for name in (EVALUATION, "config.yaml", VERSIONS, LOCK):
+            (self.path / name).unlink(missing_ok=True)
+        for folder in (self.checkpoints, self.path):
+            with contextlib.suppress(OSError):  # something else is in it
+                folder.rmdir()
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """A context in which no other process trains in this folder; removes what a killed one left half written.
+        """A context in which no other process works in this folder; removes what a killed one left half written.
 
         The system drops the lock with the process, however that ends.
 
@@ -175,7 +194,7 @@ class RunFolder:
             InputError: if another process has it, or the folder cannot be written.
         """
         try:
-            descriptor = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+            descriptor = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
             raise InputError(f"Cannot write in {self.path} ({error.strerror}): make the folder writable.") from error
         try:
@@ -183,7 +202,7 @@ class RunFolder:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 raise InputError(
-                    f"Another process is training in {self.path}: wait until it ends, or choose another --out."
+                    f"Another process is at work in {self.path}: wait until it ends, or choose another --out."
                 ) from error
             for place in (self.path, self.checkpoints, self.replay, self.nonfinite):
                 for path in place.glob(".*"):
@@ -249,6 +268,14 @@ class RunFolder:
         whole = with_digests(result | trained, self.path)
         write_json(self.path / "result.json", whole)
         return whole
+
+
+def default_folder(config: RunConfig, agent: str, suffix: str = "") -> Path:
+    """runs/<env>/<agent>-<guidance>-s<seed>-<time>, and -2, -3, ... after it where that is taken."""
+    time = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    name = f"{agent}-{config.guidance}-s{config.seed}-{time}{suffix}"
+    names = itertools.chain([name], (f"{name}-{k}" for k in itertools.count(2)))
+    return next(path for each in names if not os.path.lexists(path := Path("runs") / config.env / each))
 
 
 def make_result(

@@ -54,6 +54,15 @@ class StartNumber:
     low: float
     high: float
 
+    @property
+    def free(self) -> bool:
+        """Whether it can be chosen: not where its range is one value."""
+        return self.high > self.low
+
+    def share_of(self, value: float) -> float:
+        """Share of the way from the lowest to the highest value; 0 where these are the same."""
+        return (value - self.low) / (self.high - self.low) if self.free else 0.0
+
 
 @dataclass(frozen=True)
 class ChosenStarts:
@@ -76,7 +85,7 @@ def standing_starts(grid: Grid) -> ChosenStarts:
     numbers = (*names, StartNumber("yaw", "rad", 0.0, 2 * pi))
 
     def shares(u: Tensor, pose: Pose) -> Tensor:
-        place = [(float(x) - n.low) / (n.high - n.low) for x, n in zip(pose[0], names, strict=False)]
+        place = [n.share_of(float(x)) for x, n in zip(pose[0], names, strict=False)]
         return torch.tensor([*place, float(yaw_of(pose[1]) / (2 * pi) % 1)]).clamp(0, 1)
 
     return ChosenStarts(numbers, lambda chosen: chosen.repeat(TRIES), shares)
