@@ -33,9 +33,11 @@ def test_an_evaluation_is_not_gone_on_with(
 ):
     folder = tmp_path / "eval"
     if state == "interrupted":
+        usual = run.evaluate_zero
         monkeypatch.setattr(run, "evaluate_zero", interrupted)
         with pytest.raises(KeyboardInterrupt):
             call(run, monkeypatch, *EVALUATE.split(), "--out", str(folder))
+        monkeypatch.setattr(run, "evaluate_zero", usual)
         assert not (folder / "result.json").exists()
     else:
         assert call(run, monkeypatch, *EVALUATE.split(), "--out", str(folder)) == 0
@@ -49,11 +51,13 @@ def test_an_evaluation_is_not_gone_on_with(
     for more in ("", " --total-steps 9000000"):
         said = refusal(run, monkeypatch, capsys, f"--resume {folder}{more}")
         assert f"{folder} holds an evaluation, in which nothing is trained" in said
-    for words in (EVALUATE, "--env DoraCube-v1 --workers 0"):
+    ended = (folder / "result.json").exists()
+    for words in (*[EVALUATE][:ended], "--env DoraCube-v1 --workers 0"):
         said = refusal(run, monkeypatch, capsys, f"{words} --out {folder}")
         assert f"{folder} holds an evaluation already" in said
         assert "--resume" not in said
     assert state_of(folder) == before
+    assert ended or call(run, monkeypatch, *EVALUATE.split(), "--out", str(folder)) == 0  # it is begun again
 
 
 @pytest.mark.parametrize("damage", ["damaged", "missing"])
