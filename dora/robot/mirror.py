@@ -50,8 +50,8 @@ mirrored.
 
 
 def mirrored_name(text: str) -> str:
-    """A name of the image: "Right_Thumb_0" becomes "Left_Thumb_0", and the other way round."""
-    return re.sub("|".join(SIDES), lambda found: SIDES[found[0]], text)
+    """A name of the image: "Right_Thumb_0" becomes "Left_Thumb_0", and the other way round; "upright" stays."""
+    return re.sub(f"(?<![a-z])(?:{'|'.join(SIDES)})|(?<=[a-z])(?:Right|Left)", lambda found: SIDES[found[0]], text)
 
 
 def mirrored_urdf(text: str, name: str, source: str) -> str:

@@ -29,6 +29,8 @@ POINTS_ON_PALM = 40
 """Number of contact points on the palm."""
 LEAST = 1e-6
 """Length of a link [m], or of a mean direction [1], below which it has no direction."""
+MOST_FINGERS = 5
+"""Fingers that have a contact class."""
 MOST_SPHERES, MOST_AREA = 20_000, 1.0
 """Largest number of spheres on the capsules of a hand, and area of their surfaces together [m^2]."""
 
@@ -91,8 +93,8 @@ class HandModel:
         palm_frame: axes and centre of the palm in the wrist frame.
 
     Raises:
-        InputError: the robot has no finger, a finger has a joint that is not revolute or no collision shape, the shapes
-            are too many or too large, or the palm faces nowhere.
+        InputError: the robot has no finger or more than `MOST_FINGERS`, a finger has a joint that is not revolute or no
+            collision shape, the shapes are too many or too large, or the palm faces nowhere.
     """
 
     def __init__(
@@ -100,6 +102,11 @@ class HandModel:
     ) -> None:
         if not robot.fingers:
             raise InputError(f"robot {robot.name!r} has no finger; grasps need [fingers.*] in robot.toml.")
+        if len(robot.fingers) > MOST_FINGERS:
+            raise InputError(
+                f"robot {robot.name!r} has {len(robot.fingers)} fingers; there are contact classes for {MOST_FINGERS}: "
+                "describe no more in robot.toml."
+            )
         self.robot, self.dtype, self.device = robot, dtype, torch.device(device)
         root = len(robot.model.chain(robot.wrist_link))
         chains = [robot.model.chain(finger.tip)[root:] for finger in robot.fingers.values()]

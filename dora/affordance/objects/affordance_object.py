@@ -190,7 +190,12 @@ def moved(mesh: trimesh.Trimesh, offset: Float[np.ndarray, " 3"]) -> trimesh.Tri
 def support_height(mesh: trimesh.Trimesh, rest: tuple[float, float, float, float]) -> float:
     """Height of the origin above the lowest point of a mesh in the orientation `rest` (wxyz) [m]."""
     turn = trimesh.transformations.quaternion_matrix(rest)[:3, :3]
-    return float(-(mesh.vertices @ turn[2]).min())
+    return float(-(corners(mesh) @ turn[2]).min())
+
+
+def corners(mesh: trimesh.Trimesh) -> Float[np.ndarray, "n 3"]:
+    """The vertices (n, 3) of a mesh that belong to a triangle; editors of meshes leave others behind."""
+    return mesh.vertices[np.unique(mesh.faces)]
 
 
 def mass_properties(

@@ -28,14 +28,14 @@ def own_objects() -> Path:
 
 
 def object_places() -> dict[str, Path]:
-    """Folder, or mesh file, of every object that can be named; of two with one name the later place counts."""
+    """Folder, or mesh file, of every object that can be named; of two with one name the later place counts, and in
+    it the folder."""
     found: dict[str, Path] = {}
     extra = [Path(part) for part in os.environ.get(SEARCH_VARIABLE, "").split(os.pathsep) if part]
-    for path in (path for place in (own_objects(), *extra) for path in entries(place)):
-        if path.suffix.lower() in MESHES:
-            found[path.stem] = path
-        elif os.path.isfile(path / OBJECT_FILE):
-            found[path.name] = path
+    for place in (own_objects(), *extra):
+        there = entries(place)
+        found |= {path.stem: path for path in there if path.suffix.lower() in MESHES}
+        found |= {path.name: path for path in there if os.path.isfile(path / OBJECT_FILE)}  # made from such a mesh
     return found
 
 

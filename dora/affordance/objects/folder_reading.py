@@ -19,6 +19,7 @@ from dora.affordance.objects.affordance_object import (
     AffordanceObject,
     Piece,
     Placement,
+    corners,
     support_height,
     surface_digest,
 )
@@ -111,7 +112,7 @@ class _Reader:
         names, classes = self.regions(content["regions"])
         mesh, labels = self.surface(content["mesh"], names)
         mass = self.within(content["mass"], MASSES, "mass")
-        reach = float(np.linalg.norm(mesh.vertices, axis=1).max())
+        reach = float(np.linalg.norm(corners(mesh), axis=1).max())
         rest = self.quaternion(content.get("rest", list(UPRIGHT)), "rest")
         return AffordanceObject(
             name=content["name"],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from dora.affordance.objects.affordance_object import AffordanceObject
 from dora.affordance.search.cache import chain_hand_of, field_of, hand_of
@@ -70,12 +70,15 @@ def descent_of(energy: GraspEnergy) -> type[Descent]:
     return DifferentiableDescent if isinstance(energy, DifferentiableEnergy) else Descent
 
 
+def _name_of(function: Any) -> str:
+    """Module and name of a function, or of the class of what is called like one."""
+    named = function if hasattr(function, "__qualname__") else type(function)
+    return f"{named.__module__}.{named.__qualname__}"
+
+
 def described(kinematics: str, extra: ExtraEnergies | None) -> str:
     """What follows the settings in the text that goes with candidates; nothing for compiled loops."""
     if kinematics == "compiled":
         return ""
-    energies = [
-        f", {name}={weight!r}*{function.__module__}.{function.__qualname__}"
-        for name, (weight, function) in (extra or {}).items()
-    ]
+    energies = [f", {name}={weight!r}*{_name_of(function)}" for name, (weight, function) in (extra or {}).items()]
     return f" kinematics={kinematics!r}{''.join(energies)}"

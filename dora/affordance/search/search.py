@@ -83,9 +83,11 @@ class Settings:
     spread: Spread = field(default_factory=Spread)
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "contacts", "resample", "starts", "batch"):
-            if getattr(self, name) < 1:
+        for name in ("iterations", "contacts", "resample", "starts", "batch", "polish", "oversampling", "field_size"):
+            if not getattr(self, name) >= 1:
                 raise InputError(f"the search needs {name} of at least 1, not {getattr(self, name)}.")
+        if not 0 <= self.ramp_start < 1:
+            raise InputError(f"the search needs ramp_start from 0 to below 1, not {self.ramp_start}.")
         if not 0 <= self.seat <= MOST_SEATING:
             raise InputError(f"the hand can be closed by 0 to {MOST_SEATING} rad after the search, not by {self.seat}.")
 

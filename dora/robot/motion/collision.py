@@ -134,7 +134,7 @@ class CollisionModel:
 
     def _robot_parts(self) -> Iterator[_Part]:
         for link, shapes in self.robot.shapes.items():
-            frame = self._model.frames[self._model.getFrameId(link)]
+            frame = self._model.frames[self._model.getFrameId(link, self._pin.FrameType.BODY)]
             for shape in shapes:
                 body, local = self._solid(shape)
                 yield _Part(link, frame.parentJoint, frame.placement * local, body)
