@@ -193,8 +193,16 @@ def test_xml_that_is_small_is_read(tmp_path: Path):
         ("curve.csv", f"{CURVE}\n1,1,7,0,0\n", "not from 0 to 1"),
         ("curve.csv", f"{CURVE}\n1,1,0,0,-2\n", "negative depth"),
         ("eval.csv", "episode,success\n" + "1,1\n" * 20_001, "rows"),
-        ("eval.csv", "episode,success\n" + "1,1\n" * 20, "a share of 1 are successes, and result.json says 0.5"),
-        ("zero.csv", "episode,success\n" + "1,1\n1,0\n" * 3, "it has 6 episodes, and result.json says 20"),
+        (
+            "eval.csv",
+            "episode,success\n" + "".join(f"{k},1\n" for k in range(20)),
+            "a share of 1 are successes, and result.json says 0.5",
+        ),
+        (
+            "zero.csv",
+            "episode,success\n" + "".join(f"{k},{k % 2}\n" for k in range(6)),
+            "it has 6 episodes, and result.json says 20",
+        ),
         ("eval.csv", "episode,success\n1,0.5\n", "success is not 0 or 1"),
         ("zero.csv", "episode,success\n1,nan\n", "success is not 0 or 1"),
         ("zero.csv", "episode,win\n1,1\n", "lacks a column"),

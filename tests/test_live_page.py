@@ -146,7 +146,7 @@ def test_choices_give_orders(watched: Watched, page: Page):
 def test_sliders_move_the_start_and_keep_each_other(watched: Watched, page: Page):
     sliders: Any = page.panel.sliders
     numbers, before = watched.state.setup.numbers, watched.state.episode.shares
-    assert [slider.value for slider in sliders] == pytest.approx(
+    assert [slider.value for slider in sliders.values()] == pytest.approx(
         [n.low + share * (n.high - n.low) for n, share in zip(numbers, before, strict=True)], abs=6e-4
     )
     for count, (k, share) in enumerate(((0, 0.25), (2, 1.0)), 1):  # the second one before the first is answered

@@ -152,7 +152,7 @@ def test_a_lock_is_a_file_that_all_may_read_and_only_its_owner_writes(tmp_path: 
     try:
         with RunFolder(tmp_path).locked():
             assert (tmp_path / ".lock").stat().st_mode & 0o777 == 0o644
-            with pytest.raises(InputError, match="Another process is training"), RunFolder(tmp_path).locked():
+            with pytest.raises(InputError, match="Another process is at work"), RunFolder(tmp_path).locked():
                 pass
         with RunFolder(tmp_path).locked():
             pass

@@ -125,7 +125,7 @@ def seal(path: Path) -> None:
         InputError: a file cannot be read.
         OSError: the checksums cannot be written.
     """
-    path.with_suffix(SUMS).write_bytes(os.fsencode(_sums(path, path.stem)))
+    path.with_suffix(SUMS).write_bytes(os.fsencode("".join(_sums(path, path.stem).values())))
 
 
 def _check_whole(path: Path) -> None:
@@ -145,21 +145,19 @@ def _check_whole(path: Path) -> None:
     found = os.fsdecode(read_bytes(sums, "file of checksums", MOST_SUMS))
     stem = found.partition("  ")[2].partition(f"{path.suffix}\n")[0]  # all three files may have been renamed
     expected = _sums(path, stem)
-    if found == expected:
+    if found == "".join(expected.values()):
         return
-    lines = found.splitlines()
-    names = (path.name, path.with_suffix(".json").name)
-    changed = [name for name, line in zip(names, expected.splitlines(), strict=True) if line not in lines]
+    changed = [name for name, line in expected.items() if line not in found]
     raise InputError(
         f"{path.with_name(changed[0]) if changed else sums} is not as it was written, by its checksum in {sums.name}: "
         f"record it again, or remove {sums.name} to play it as it is."
     )
 
 
-def _sums(path: Path, stem: str) -> str:
-    """A line for each file of a recording, as of `sha256sum`, under names with this stem."""
+def _sums(path: Path, stem: str) -> dict[str, str]:
+    """A line for each file of a recording, as of `sha256sum`, under names with this stem; by the names of now."""
     files = (path, path.with_suffix(".json"))
-    return "".join(f"{file_sha256(file)}  {stem}{file.suffix}\n" for file in files)
+    return {file.name: f"{file_sha256(file)}  {stem}{file.suffix}\n" for file in files}
 
 
 def _named(episode: Any, path: Path) -> tuple[str, int]:

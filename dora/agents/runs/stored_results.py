@@ -173,10 +173,10 @@ def read_episodes(path: Path) -> dict[str, list[float]]:
     columns = _read_table(path, EPISODE_COLUMNS, MOST_EPISODES, all_columns=True)
     if not columns["success"]:
         raise _damaged(path, "it has no episode")
-    if columns["episode"] != list(range(len(columns["episode"]))):
-        raise _damaged(path, "its episodes are not 0, 1, 2, ... from line to line")
     if not all(value in (0.0, 1.0) for value in columns["success"]):
         raise _damaged(path, "success is not 0 or 1 everywhere")
+    if columns["episode"] != list(range(len(columns["episode"]))):
+        raise _damaged(path, "its episodes are not 0, 1, 2, ... from line to line")
     if unknown := [name for name, values in columns.items() if any(map(math.isnan, values))]:
         raise _damaged(path, f"{unknown[0]} is no number somewhere")
     return columns
