@@ -6,7 +6,6 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -133,6 +132,6 @@ def test_compiled_code_belongs_to_the_text_of_all_that_goes_into_it(tmp_path: Pa
         path.write_text(text)
     function: Any = field.sample
     assert compiling.digest_of_sources(compiling.SOURCES) in str(function._cache.cache_path)
-    assert "numba-" not in (numba.config.CACHE_DIR or "")
+    assert "numba-" not in (compiling.SETTINGS.CACHE_DIR or "")
     files = {path.name for place in compiling.SOURCES for path in ([place] if place.is_file() else place.rglob("*.py"))}
     assert {"energies.py", "signed_distance.py", "closing.py"} <= files

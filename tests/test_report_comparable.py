@@ -19,19 +19,21 @@ ON_THE_JUG = "affordance gains on the jug with PPO"
 def seeds(count: int = 3, **more: Any) -> list[Run]:
     """Runs of several seeds, all of whose 20 episodes succeed where nothing else is said."""
     episodes = more.pop("episodes", of(*[1.0] * 20))
-    known = {"eval_episodes": 20, "episodes": episodes, "rate": float(episodes["success"].mean())}
-    return [made(**known | more | {"seed": 10 + k}) for k in range(count)]
+    known: dict[str, Any] = {"eval_episodes": 20, "episodes": episodes, "rate": float(episodes["success"].mean())}
+    settings: dict[str, Any] = known | more
+    return [made(**settings, seed=10 + k) for k in range(count)]
 
 
 # ------------------------------------------------------------------ the same task
 
 
 def test_no_verdict_is_given_over_tasks_with_other_numbers():
-    ours, other = ({"task_config": {"limit": limit, "optimised": limit == 1}} for limit in (1, 2))
-    mixed = [*seeds(agent="ppo", **ours), *seeds(agent="sac", **other)]
+    numbers = [{"task_config": {"limit": limit, "optimised": limit == 1}} for limit in (1, 2)]
+    ours, other = numbers[0], numbers[1]
+    mixed = [*seeds(3, agent="ppo", **ours), *seeds(3, agent="sac", **other)]
     (verdict,) = (row[-1] for row in rows(mixed, BEST) if row[0] == JUG)
     assert verdict == "cannot be said: runs of DoraJug-v1 have other numbers of the task"
-    guided, plain = seeds(**ours), seeds(guidance="none", episodes=of(*[0.0] * 20), **other)
+    guided, plain = seeds(3, **ours), seeds(3, guidance="none", episodes=of(*[0.0] * 20), **other)
     (verdict,) = (row[-1] for row in rows([*guided, *plain], CLAIMS) if row[0] == ON_THE_JUG)
     assert verdict.startswith("cannot be said")
     assert rows([*guided, *plain], GAINS)[0][2] == "the tasks have other numbers"

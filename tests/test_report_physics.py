@@ -106,10 +106,10 @@ def test_the_run_that_trained_a_policy_is_told_by_its_file_else_by_its_seed():
     trained = [
         made(f"t{seed}", won=won, seed=seed, policy_digest=f"of {seed}") for seed, won in ((10, "1111"), (11, "1000"))
     ]
-    of_ten = {"policy_seed": 10, "seed": 11, "first_seed": 6}
-    assert cells(*trained, again("b", FINER, **of_ten, policy_digest="of 10"))[0][6] == "100.0"
-    assert cells(*trained, again("b", FINER, **of_ten))[0][6] == "100.0"
-    assert cells(*trained, again("b", FINER, **of_ten, policy_digest="of another run of seed 10")) == []
+    of_ten: dict[str, Any] = {"policy_seed": 10, "seed": 11, "first_seed": 6}
+    assert cells(*trained, again("b", FINER, "1000", **of_ten, policy_digest="of 10"))[0][6] == "100.0"
+    assert cells(*trained, again("b", FINER, "1000", **of_ten))[0][6] == "100.0"
+    assert cells(*trained, again("b", FINER, "1000", **of_ten, policy_digest="of another run of seed 10")) == []
     assert cells(*trained, again("b", FINER, seed=11, first_seed=6)) == []  # of an earlier version: either seed
 
 

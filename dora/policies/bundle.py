@@ -21,7 +21,7 @@ from dora.agents.config import RunConfig
 from dora.agents.evaluation.evaluate import FINAL_SEED, Evaluation
 from dora.agents.evaluation.play import evaluate_checkpoint
 from dora.agents.reports.failures import first_causes
-from dora.agents.reports.run_results import DEFAULT_PRESET, Run, find_runs
+from dora.agents.reports.run_results import DEFAULT_PRESET, SECONDS_PER_MINUTE, Run, find_runs
 from dora.configs import plain
 from dora.errors import InputError, command
 from dora.files import make_folder, write_bytes
@@ -203,7 +203,7 @@ def make_card(choice: Choice, evaluation: Evaluation, run: str, commit: str | No
         preset=config.preset,
         env_steps=progress["env_steps"],
         total_steps=config.total_steps,
-        minutes=choice.run.minutes,
+        minutes=result["wall_seconds"] / SECONDS_PER_MINUTE,
         chosen_among=choice.among,
         training_success=progress["best"][0],
         training_episodes=config.eval_episodes,

@@ -11,13 +11,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numba
 from numba import njit
+from numba.core import config
 
 import dora.affordance.objects.signed_distance
 
 SOURCES = (Path(__file__).parents[1], Path(dora.affordance.objects.signed_distance.__file__))
 """Folder and file whose text may go into compiled functions."""
+SETTINGS: Any = config
+"""Of Numba, which makes their names while it is imported."""
 DIGITS = 16
 """Hexadecimal digits of the digest of these texts."""
 
@@ -37,15 +39,15 @@ def inlined(function: Callable) -> Callable:
 
 def _compiled(function: Callable, **options: Any) -> Callable:
     plain, options = inspect.unwrap(function), {"error_model": "numpy", "fastmath": RELAXED, **options}
-    usual = numba.config.CACHE_DIR
+    usual = SETTINGS.CACHE_DIR
     kept = Path(usual) if usual else Path(__file__).parent / "__pycache__"
-    numba.config.CACHE_DIR = str(kept / f"numba-{_own_digest()}")  # read when a function is decorated
+    SETTINGS.CACHE_DIR = str(kept / f"numba-{_own_digest()}")  # read when a function is decorated
     try:
         return njit(cache=True, **options)(plain)
     except RuntimeError:  # neither the folder of the code nor that of the user can be written: each process compiles
         return njit(**options)(plain)
     finally:
-        numba.config.CACHE_DIR = usual
+        SETTINGS.CACHE_DIR = usual
 
 
 @cache
