@@ -82,10 +82,10 @@ def test_a_run_that_was_repeated_on_another_machine_or_with_more_episodes_counts
 
 def test_evaluations_of_policies_are_told_apart_by_their_files(tmp_path: Path):
     """Not by their paths, which may be the same for several, or several for the same."""
-    for k, (path, digest) in enumerate((("best", "x"), ("/a/best", "x"), ("best", "y"), ("best", "z"))):
+    for k, (path, digest) in enumerate((("best", "x"), ("/a/best", "x"), ("best", "y"), ("best", "w"), ("best", "z"))):
         more: Any = {"checkpoint": path, "policy_seed": 10 + (digest == "z"), "policy_digest": digest}
         write(tmp_path / f"run{k}", config_digest="a" * 12, **more)
-    assert cells(tmp_path) == [("affordance", "3", "50.0, 50.0, 50.0")]
+    assert cells(tmp_path) == [("affordance", "4", "50.0, 50.0, 50.0, 50.0")]
     (row,) = table_rows(find_runs(tmp_path))
     assert row[2] == "PPO, evaluated again"
     assert row[-1] == "-"  # minutes: nothing was trained
