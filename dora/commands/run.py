@@ -35,7 +35,7 @@ from dora.agents.runs.interrupt import STATUS, ending_at_once
 from dora.agents.runs.logging import add_film
 from dora.agents.runs.recommended import learners_of, recommended
 from dora.agents.runs.run_folder import RunFolder, default_folder, make_result
-from dora.agents.runs.stored_results import read_result
+from dora.agents.runs.stored_results import NO_CORRECTION, read_result
 from dora.agents.runs.trainer import Trainer
 from dora.configs import plain
 from dora.digests import file_sha256
@@ -49,8 +49,6 @@ from dora.version import source_commit
 
 VIDEO_EPISODES = 3
 """Episodes of a film [1]."""
-ZERO = "zero"
-"""Name of the agent that evaluates as zero correction."""
 ENTRANCES = ("--env", "--eval-only", "--checkpoint", "--resume", "--like")
 """Options that say what is run."""
 OF_TRAINING = (
@@ -328,7 +326,7 @@ def evaluate_only(args: Args) -> Path:
     """Film, if asked for, and evaluate a checkpoint or zero correction into a new run folder, which is returned."""
     config, commit = args.run, source_commit()
     path = None if args.checkpoint is None else checkpoint_path(args.checkpoint)
-    agent = ZERO if path is None else config.agent
+    agent = NO_CORRECTION if path is None else config.agent
     folder = RunFolder(args.out or default_folder(config, agent, "-eval"))
     folder.check_free(evaluation=True)
     os.environ[RECORDS] = str(folder.nonfinite.absolute())  # processes that are started later see it, too

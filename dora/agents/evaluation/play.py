@@ -138,8 +138,9 @@ def record(
 
 
 def write_film(path: Path, episodes: Iterable[Sequence[UInt8[np.ndarray, "h w 3"]]], rate: float | int) -> None:
-    """Write the frames of episodes, one after the other, as a film with so many frames per second [Hz]; as a GIF, whose
-    frames last multiples of 10 ms, every frame of which that can be said.
+    """Write the frames of episodes, one after the other, as a film with so many frames per second [Hz].
+
+    The frames of a GIF last multiples of 10 ms, so that it has every second, third, ... one where a frame would not.
 
     Raises:
         InputError: it cannot be written.

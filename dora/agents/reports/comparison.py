@@ -11,7 +11,6 @@ from dora.agents.reports.gains import gains, gains_of_regions, how_soon
 from dora.agents.reports.paper import DIFFERENCES, ONE_ARM, PAPER, Cell
 from dora.agents.reports.run_results import (
     DEFAULT_PRESET,
-    NO_CORRECTION,
     OF_CANDIDATES,
     SHARED,
     UNKNOWN,
@@ -37,6 +36,7 @@ from dora.agents.reports.section import (
     with_interval,
 )
 from dora.agents.reports.statistics import aggregates, crossed_interval, paired_difference
+from dora.agents.runs.stored_results import NO_CORRECTION
 
 TOLD = (("reorient", "in_hand"), ("hand_action", "fingers"))
 """Numbers of tasks that make another task of one, also where all runs have them."""

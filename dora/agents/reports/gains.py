@@ -19,6 +19,8 @@ from dora.agents.reports.statistics import mean_of_curve, paired_difference
 
 OTHER_TASK = "the tasks have other numbers"
 """In the place of a difference between runs that did not do the same."""
+MOST = 0.8
+"""Share of successes of the entry `steps_to_80` of a result [1]."""
 IN_STEPS, IN_MINUTES = (0.5, 0.8), (0.5, 0.8, 0.9)
 """Shares of successes in training's evaluations whose steps and whose minutes are told [1]."""
 
@@ -86,7 +88,7 @@ def how_soon(runs: Sequence[Run]) -> Section:
 
 def _reached(runs: Sequence[Run], share: float, column: str, unit: float | int, after: str) -> str:
     """Mean of a column of the learning curves in the first row with such a share of successes."""
-    first = [next((row[column] for row in run.curve if row["success_rate"] >= share), None) for run in runs]
+    first = [_first(run, share, column) for run in runs]
     known = [value / unit for value in first if value is not None]
     count = "" if len(known) == len(runs) else f" ({len(known)} of {len(runs)})"
     return f"{mean(known):.{0 if after else 1}f}{after}{count}" if known else "never"
@@ -95,16 +97,16 @@ def _reached(runs: Sequence[Run], share: float, column: str, unit: float | int, 
 def _steps(runs: Sequence[Run]) -> str:
     """Steps to 80 % of the seeds that reached it, of those whose evaluations are known."""
     told = [run for run in runs if run.curve or "steps_to_80" in run.result]
-    known = [run.result["steps_to_80"] if "steps_to_80" in run.result else _steps_to(run, 0.8) for run in told]
+    known = [run.result.get("steps_to_80", _first(run, MOST, "env_steps")) for run in told]
     reached = [steps for steps in known if steps is not None]
     if not known:
         return NONE
     return f"{mean(reached) / 1000:.0f}k ({len(reached)} of {len(known)})" if reached else f"never (0 of {len(known)})"
 
 
-def _steps_to(run: Run, share: float) -> float | None:
-    """Steps of the first evaluation during training with such a share of successes."""
-    return next((row["env_steps"] for row in run.curve if row["success_rate"] >= share), None)
+def _first(run: Run, share: float, column: str) -> float | None:
+    """A column of the learning curve in its first row with such a share of successes."""
+    return next((row[column] for row in run.curve if row["success_rate"] >= share), None)
 
 
 def _gain_of_mean(guided: Sequence[Run], plain: Sequence[Run]) -> str:
@@ -126,12 +128,8 @@ def _same_but_regions(runs: Sequence[Run]) -> Iterator[tuple[list[Run], list[Run
     rows = grouped(runs)
     for guided, members in rows.items():
         for plain, others in rows.items():
-            same = guided[:3] == plain[:3] and guided[4] == plain[4]
-            whole = members[0].result["guidance"] == "affordance" and not members[0].result.get("guidance_parts")
-            if same and whole and others[0].result["guidance"] == "grasps" and _alike(members[0], others[0]):
+            ours, theirs = members[0], others[0]
+            same = guided[:3] == plain[:3] and guided[4] == plain[4] and same_values(ours.settings, theirs.settings)
+            whole = ours.result["guidance"] == "affordance" and not ours.result.get("guidance_parts")
+            if same and whole and theirs.result["guidance"] == "grasps":
                 yield members, others, guided
-
-
-def _alike(one: Run, other: Run) -> bool:
-    """Whether two runs have the same settings, of those that are known of both, whatever chooses the candidates."""
-    return same_values(one.settings, other.settings)

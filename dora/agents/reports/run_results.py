@@ -12,7 +12,7 @@ from jaxtyping import Float
 from dora.agents.config import NEUTRAL, NEUTRAL_LEARNER, TRAINING, WITHOUT_EFFECT, in_effect
 from dora.agents.evaluation.evaluate import FINAL_SEED
 from dora.agents.runs.progress_table import read_progress
-from dora.agents.runs.stored_results import check_agreement, read_curve, read_episodes, read_result
+from dora.agents.runs.stored_results import NO_CORRECTION, check_agreement, read_curve, read_episodes, read_result
 from dora.configs import flat
 from dora.errors import InputError
 from dora.files import files_under
@@ -38,8 +38,6 @@ IN_WORDS = {
 """Values of numbers of tasks, by name and value, as readers of a table know them."""
 WITHOUT_OVERLAP = {"after_overlap": "1.0", "placed_after_overlap": "1.0", "weights.penetration": "0.0"}
 """Numbers of a task with which its reward does not depend on overlap: named together."""
-NO_CORRECTION = "zero"
-"""Agent of evaluations of zero correction alone."""
 ALWAYS = ("optimised",)
 """Numbers of tasks that are named whatever most runs of a row have, since neither of their values is the usual one."""
 
@@ -328,7 +326,7 @@ def same_values(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 
 def seeds_of(runs: Sequence[Run]) -> int:
-    """Number of trained policies among the runs, one for each seed; of zero correction, of the runs."""
+    """Number of policies among the runs: those of one row differ in their seed."""
     return len({run.policy for run in runs})
 
 

@@ -20,6 +20,8 @@ MOST_COLUMNS, LONGEST_NAME, LONGEST_PATH = 1000, 200, 4096
 """Largest number of columns of a table, and of characters of a text and of a path [1]."""
 PIECE = 2**20
 """Size of the pieces in which a table's digest is computed [bytes]."""
+NO_CORRECTION = "zero"
+"""Agent of a result of zero correction alone."""
 ROUNDING = 1e-4
 """Largest difference of a share that is written twice [1]."""
 LARGEST = 1e12
