@@ -46,6 +46,33 @@ def test_a_hole_that_is_seen_whole_from_its_middle_is_closed():
     assert repair(open_cup, np.zeros(len(open_cup.faces), int), "cup").mesh.is_watertight
 
 
+def klein_bottle(around: int = 24, across: int = 12) -> trimesh.Trimesh:
+    """Closed, since every edge has two faces, and with one side only: a figure of 8 that turns by half a turn."""
+    u, v = np.meshgrid(*(np.linspace(0, 2 * np.pi, n, endpoint=False) for n in (around, across)), indexing="ij")
+    radius = 2 + np.cos(u / 2) * np.sin(v) - np.sin(u / 2) * np.sin(2 * v)
+    height = np.sin(u / 2) * np.sin(v) + np.cos(u / 2) * np.sin(2 * v)
+    vertices = 0.02 * np.stack([radius * np.cos(u), radius * np.sin(u), height], -1).reshape(-1, 3)
+
+    def at(i: int, j: int) -> int:
+        return i * across + j % across if i < around else -j % across
+
+    corners = [(at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)) for i in range(around) for j in range(across)]
+    return trimesh.Trimesh(vertices, [face for a, b, c, d in corners for face in ((a, b, c), (a, c, d))], process=False)
+
+
+@pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside a box"])
+def test_a_surface_with_one_side_only_is_refused(beside: bool):
+    mesh = klein_bottle()
+    assert mesh.is_watertight
+    if beside:
+        box = trimesh.creation.box((0.1, 0.1, 0.1))
+        vertices = np.concatenate([mesh.vertices, box.vertices + np.array([0.3, 0, 0])])
+        faces = np.concatenate([mesh.faces, box.faces + len(mesh.vertices)])
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+    with pytest.raises(InputError, match="one side only"):
+        repair(mesh, np.zeros(len(mesh.faces), int), "bottle")
+
+
 def test_a_region_that_earlier_ones_cover_is_refused(tmp_path: Path):
     box = trimesh.creation.box((0.1, 0.05, 0.05))
     box.export(tmp_path / "a.stl")

@@ -114,3 +114,38 @@ def test_hollow_jug_is_filled():
 def test_an_absurdly_large_object_is_refused():
     with pytest.raises(InputError, match="too large for a hand"):
         SignedDistanceField(trimesh.creation.box((6.0, 6.0, 6.0)))
+
+
+def with_flat_triangles(turn: np.ndarray, inward: bool) -> trimesh.Trimesh:
+    """A box of 10 x 10 x 5 cm with points on one edge of each end, which is a fan from a corner, as in CAD."""
+    along = np.linspace(0, 0.1, 9)
+    outline = np.array([*((x, 0.0) for x in along), (0.1, 0.1), (0.0, 0.1)])
+    n = len(outline)
+    low, high = (np.column_stack([outline, np.full(n, z)]) for z in (0.0, 0.05))
+    ends = [face for i in range(1, n - 1) for face in ((0, i + 1, i), (n, n + i, n + i + 1))]
+    walls = [face for i in range(n) for j in [(i + 1) % n] for face in ((i, j, n + j), (i, n + j, n + i))]
+    mesh = trimesh.Trimesh(np.concatenate([low, high]) @ turn.T, ends + walls, process=False)
+    if inward:
+        mesh.invert()
+    return mesh
+
+
+@pytest.mark.parametrize("inward", [False, True], ids=["outward", "inward"])
+@pytest.mark.parametrize("seed", range(3))
+def test_flat_triangles_turn_no_sign_and_no_normal(seed: int, inward: bool):
+    """Turned, so that the area of a flat triangle is rounding instead of 0."""
+    rng = np.random.default_rng(seed)
+    turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
+    mesh = with_flat_triangles(turn, inward)
+    assert mesh.is_watertight
+    size, around = np.array([0.1, 0.1, 0.05]), rng.uniform(-0.03, 0.13, (5000, 3))
+    exact = ExactDistance(mesh)
+    away = np.linalg.norm(np.maximum(np.maximum(-around, around - size), 0), axis=1)
+    deep = np.minimum(around, size - around).min(1)
+    wanted = np.where(deep > 0, -deep, away) * (-1 if inward else 1)
+    np.testing.assert_allclose(exact(around @ turn.T), wanted, atol=1e-9)
+    edge = np.column_stack([rng.uniform(0, 0.1, 500), np.zeros(500), rng.choice([0.0, 0.05], 500)])
+    normals = exact.with_gradient(edge @ turn.T)[:, 1:] @ turn * (-1 if inward else 1)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
+    assert (normals[:, 1] < 1e-6).all()  # of the walls or of the ends that meet there, or between them
+    assert (normals[:, 2] * np.sign(edge[:, 2] - 0.02) > -1e-6).all()

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import igl
 import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float
 
+from dora.affordance.objects.signed_distance import ExactDistance
 from dora.affordance.objects.solids import hull_of
 from dora.containers import check_triangles
 from dora.digests import digest_of
@@ -91,12 +91,12 @@ def decompose(
 def deviation(mesh: trimesh.Trimesh, hulls: Sequence[trimesh.Trimesh], seed: int = 0) -> Deviation:
     """Deviation of the union of hulls from a watertight mesh, measured at random points of both surfaces."""
     surface = trimesh.sample.sample_surface(mesh, SAMPLES, seed=seed)[0]
-    uncovered = np.min([_signed_distance(hull, surface) for hull in hulls], axis=0)
+    uncovered = np.min([ExactDistance(hull)(surface) for hull in hulls], axis=0)
     areas = np.array([hull.area for hull in hulls])
     counts = np.maximum(SAMPLES * areas / areas.sum(), 1).astype(int)
     clouds = [trimesh.sample.sample_surface(h, n, seed=seed)[0] for h, n in zip(hulls, counts, strict=True)]
     union = np.concatenate([_outside_of_others(hulls, i, cloud) for i, cloud in enumerate(clouds)])
-    apart = _signed_distance(mesh, union)
+    apart = ExactDistance(mesh)(union)
     return Deviation(
         outward=max(float(apart.max()), 0.0), inward=max(float(uncovered.max()), 0.0), mean=float(np.abs(apart).mean())
     )
@@ -108,15 +108,8 @@ def _outside_of_others(
     """Those points (m, 3) of one hull's surface that lie in no other hull [m]."""
     for other, hull in enumerate(hulls):
         if other != own and len(cloud):
-            cloud = cloud[_signed_distance(hull, cloud) > TOUCHING]
+            cloud = cloud[ExactDistance(hull)(cloud) > TOUCHING]
     return cloud
-
-
-def _signed_distance(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Signed distance (n,) of points (n, 3) to a watertight surface, negative inside [m]."""
-    vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
-    signed = igl.signed_distance(np.array(points), vertices, faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)
-    return np.asarray(signed[0])
 
 
 def _run(mesh: trimesh.Trimesh, threshold: float) -> list[trimesh.Trimesh]:

@@ -36,6 +36,10 @@ CHANNELS = 4
 """Columns of a field's table without the region: distance [m] and unit gradient (3,)."""
 _TINY = 1e-12
 """Lower bound of a length by which a vector is divided [m]."""
+_FLAT = 1e-6
+"""Ratio of twice the area to the squared longest edge below which a triangle is flat: its normal is rounding [1]."""
+_ON_IT = 1e-6
+"""Distance from the surface up to which a point lies on it [m]."""
 CULL = 1.25
 """Bound on |interpolated distance - distance at the nearest node| in spacings, for unit gradients [1]."""
 
@@ -50,11 +54,20 @@ class FieldError:
 
 
 class ExactDistance:
-    """Exact signed distance to a watertight mesh [m] by libigl, on one thread."""
+    """Exact signed distance to a watertight mesh [m] by libigl, on one thread.
+
+    The sign is that of the pseudonormals (Baerentzen and Aanaes, 2005). Where the nearest triangle has a corner of a
+    flat one, as meshes of CAD programs have them, the pseudonormal may point anywhere: there, the generalised winding
+    number (Jacobson et al., 2013) decides.
+    """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self._vertices = np.array(mesh.vertices, dtype=np.float64)
         self._faces = np.array(mesh.faces, dtype=np.int64)
+        flat = _flat(self._vertices[self._faces])
+        self._sturdy = self._faces[~flat]
+        self._doubtful = np.any(np.isin(self._faces, self._faces[flat]), axis=1)
+        self._inward = bool(flat.any() and mesh.volume < 0)
 
     def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Signed distance (n,) of points (n, 3) in the mesh's frame, negative inside [m]."""
@@ -65,12 +78,29 @@ class ExactDistance:
         if not len(points):
             return np.zeros((0, CHANNELS))
         points = np.ascontiguousarray(points, dtype=np.float64)
-        distance, _, closest, normal = igl.signed_distance(
-            points, self._vertices, self._faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-        )
-        safe = np.where(np.abs(distance) > 1e-6, distance, 1.0)[:, None]
-        gradient = np.where(np.abs(distance)[:, None] > 1e-6, (points - closest) / safe, normal)
+        found = igl.signed_distance(points, self._vertices, self._faces, igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)
+        distance, face, closest, normal = map(np.asarray, found)
+        if self._doubtful.any() and (doubtful := self._doubtful[face]).any():
+            distance[doubtful] = np.abs(distance[doubtful]) * self._side(points[doubtful])
+            on_it = doubtful & (np.abs(distance) <= _ON_IT)
+            normal[on_it] = self._normals(points[on_it])
+        safe = np.where(np.abs(distance) > _ON_IT, distance, 1.0)[:, None]
+        gradient = np.where(np.abs(distance)[:, None] > _ON_IT, (points - closest) / safe, normal)
         return np.column_stack((distance, gradient))
+
+    def _side(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """-1 for points (n, 3) inside of the mesh and 1 for others (n,), by the winding number."""
+        winding = np.asarray(igl.fast_winding_number(self._vertices, self._faces, points))
+        return np.where(winding > (-0.5 if self._inward else 0.5), -1.0, 1.0)
+
+    def _normals(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Normals (n, 3) of the triangles nearest to points (n, 3), without flat ones."""
+        if not len(points):
+            return points
+        nearest = igl.point_mesh_squared_distance(points, self._vertices, self._sturdy)[1]
+        a, b, c = self._vertices[self._sturdy[np.asarray(nearest)]].transpose(1, 0, 2)
+        normal = np.cross(b - a, c - a)
+        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def unsigned(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Unsigned distance (n,) of points (n, 3) to the surface, which may be open [m]."""
@@ -184,6 +214,13 @@ class SignedDistanceField:
         found = self.distance(self.table.new_tensor(points)).double().cpu().numpy()
         difference = np.abs(found - self.exact(points))
         return FieldError(float(difference.mean()), float(difference.max()), reach)
+
+
+def _flat(corners: Float[np.ndarray, "f 3 3"]) -> np.ndarray:
+    """Whether triangles (f, 3 corners, 3) are so flat that their normals are rounding (f,)."""
+    edges = corners - np.roll(corners, 1, axis=1)
+    longest = (edges**2).sum(-1).max(1)
+    return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) < _FLAT * longest
 
 
 def _mix(corner: Tensor, share: Tensor) -> Tensor:

@@ -224,6 +224,11 @@ def _closed(part: trimesh.Trimesh, labels: np.ndarray, total_area: float, name: 
     body.fix_normals(multibody=False)
     if body.volume < LEAST_VOLUME * body.area**1.5:
         raise InputError(f"{name} encloses no volume: it is a sheet or folded into itself; give it a thickness.")
+    if not body.is_winding_consistent:
+        raise InputError(
+            f"{name} has a surface with one side only, like a Klein bottle, and so no inside: "
+            "remesh it in a mesh editor."
+        )
     turned = not np.array_equal(before, body.faces)
     wide = fills.count if added >= WIDE * area else fills.mouths
     sheet = trimesh.Trimesh(body.vertices, body.faces[:count], process=False) if wide else None
