@@ -134,6 +134,17 @@ def test_an_object_is_read_once_and_fast():
     assert load_object("jug") is load_object("jug") is load_object(own_objects() / "jug")
 
 
+def test_an_object_is_read_again_when_its_folder_has_changed(folder: Path):
+    first = load_object(folder)
+    description = folder / "object.toml"
+    before, after = f"mass = {first.mass}", f"mass = {2 * first.mass}"
+    text = description.read_text()
+    assert text.count(before) == 1
+    description.write_text(text.replace(before, after))
+    assert load_object(folder).mass == 2 * first.mass
+    assert load_object(folder) is load_object(folder)
+
+
 def test_what_objects_say_about_their_use():
     found = {name: load_object(name) for name in NAMES}
     assert {name: obj.placement for name, obj in found.items()} == {

@@ -45,7 +45,7 @@ def available_objects() -> tuple[str, ...]:
 
 
 def load_object(name: str | Path) -> AffordanceObject:
-    """An object, read once per process.
+    """An object, read once per process, and again if its files have changed.
 
     Args:
         name: one of `available_objects`, the folder of an object.toml, or a mesh file, which is taken to be in metres
@@ -57,15 +57,24 @@ def load_object(name: str | Path) -> AffordanceObject:
     places = object_places()
     path = places.get(str(name), Path(name))
     if os.path.isdir(path):
-        return _read_folder(path.resolve())
+        return _read_folder(path.resolve(), _times(path))
     if os.path.isfile(path):
         return _read_mesh(path.resolve(), path.stat().st_mtime_ns)
     hint = suggestion(name, sorted(places))
     raise InputError(f"there is no object {str(name)!r}, nor a folder or mesh at that path: {hint}")
 
 
+def _times(folder: Path) -> tuple[int, ...]:
+    """Times of the last changes of an object's description and meshes [ns]; none if they may not be looked at."""
+    try:
+        return tuple(path.stat().st_mtime_ns for path in (folder / "object.toml", *sorted(folder.glob("*.ply"))))
+    except OSError:
+        return ()
+
+
 @functools.cache
-def _read_folder(folder: Path) -> AffordanceObject:
+def _read_folder(folder: Path, times: tuple[int, ...]) -> AffordanceObject:
+    """The object of a folder as it was at the times of its last changes."""
     return read_object_folder(folder)
 
 
