@@ -8,6 +8,7 @@ import io
 from collections.abc import Sequence
 
 import jinja2
+from markupsafe import Markup, escape
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -38,8 +39,19 @@ def markdown_text(text: str) -> str:
     return "".join(f"\\{c}" if c in MARKS else c for c in plain)
 
 
+def with_code(text: str) -> Markup:
+    """A text as HTML, escaped, in which what stands between two backticks is shown as code."""
+    pieces = [escape(piece) for piece in text.split("`")]
+    if len(pieces) % 2 == 0:
+        return escape(text)
+    return Markup("").join(Markup("<code>%s</code>") % piece if i % 2 else piece for i, piece in enumerate(pieces))
+
+
+_ESCAPED.filters["with_code"] = with_code
+
+
 def html_page(template: str, **values: object) -> str:
-    """A page from a jinja2 template; values are escaped."""
+    """A page from a jinja2 template; values are escaped. The filter of templates is `with_code`."""
     return _ESCAPED.from_string(template).render(values)
 
 

@@ -52,19 +52,19 @@ img{max-width:100%}h2{margin-top:2em}</style>
 <tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
 {%- endfor %}
 </table>
-<p>{{ note }}</p>
+<p>{{ note | with_code }}</p>
 {%- for name, picture in figures %}
 <p><img alt="{{ name }}" src="data:image/png;base64,{{ picture }}"></p>
 {%- endfor %}
 {%- for section in sections %}
-<h2>{{ section.title }}</h2>
+<h2>{{ section.title | with_code }}</h2>
 <table>
-<tr>{% for name in section.head %}<th>{{ name }}</th>{% endfor %}</tr>
+<tr>{% for name in section.head %}<th>{{ name | with_code }}</th>{% endfor %}</tr>
 {%- for row in section.rows %}
 <tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
 {%- endfor %}
 </table>
-<p>{{ section.note }}</p>
+<p>{{ section.note | with_code }}</p>
 {%- endfor %}
 """
 """Template of `report.html`, which needs no other file."""
