@@ -4,6 +4,7 @@ import importlib
 import os
 import re
 import resource
+import runpy
 import shlex
 import subprocess
 import sys
@@ -23,6 +24,10 @@ IMPORT_SECONDS = 0.5
 TRIES = 5
 """Tries of which the quickest counts; with the time of the processor, so that other work on the machine does not."""
 MODULE = (sys.executable, "-m", "dora")
+printed = pytest.mark.parametrize(
+    ("words", "unbuffered"), [(("--help",), ""), (("--help",), "1"), (("play", "--help"), "")]
+)
+"""What Dora and what a command prints, at its end and line by line."""
 
 
 def run(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -85,8 +90,7 @@ def test_without_a_command_the_usage_is_shown(capsys: pytest.CaptureFixture[str]
     assert "usage: dora COMMAND" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"], ids=["buffered", "unbuffered"])
-@pytest.mark.parametrize("words", [("--help",), ("play", "--help")], ids=" ".join)
+@printed
 def test_a_reader_that_goes_away_ends_it_without_a_traceback(words: tuple[str, ...], unbuffered: str):
     """As `dora play --help | head -1`; here nobody reads from the beginning, so that each write fails."""
     reading, writing = os.pipe()
@@ -99,8 +103,7 @@ def test_a_reader_that_goes_away_ends_it_without_a_traceback(words: tuple[str, .
     assert "BrokenPipeError" not in done.stderr
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"], ids=["buffered", "unbuffered"])
-@pytest.mark.parametrize("words", [("--help",), ("play", "--help")], ids=" ".join)
+@printed
 def test_a_full_disk_under_what_is_printed_ends_it_with_a_sentence(words: tuple[str, ...], unbuffered: str):
     environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
     with open("/dev/full", "w") as full:
@@ -185,9 +188,20 @@ SCRIPTS = sorted((Path(command.__file__).parents[1] / "experiments").glob("*.py"
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=[path.stem for path in SCRIPTS])
-def test_a_script_answers_signals_before_it_imports_what_does_the_work(script: Path):
+def test_a_script_is_its_command(script: Path, monkeypatch: pytest.MonkeyPatch):
+    started = []
+    monkeypatch.setattr(command, "start", lambda words: started.append(words) or 3)
+    monkeypatch.setattr(sys, "argv", [str(script), "--help"])
+    with pytest.raises(SystemExit) as status:
+        runpy.run_path(str(script), run_name="__main__")
+    assert status.value.code == 3
+    assert started == [[script.stem, "--help"]]
+    assert script.stem in command.COMMANDS
+
+
+def test_a_script_answers_signals_before_it_imports_what_does_the_work():
     """So that Ctrl-C during the imports shows a line and no traceback, as with `dora`."""
-    shown = run(sys.executable, "-X", "importtime", str(script), "--help").stderr
+    shown = run(sys.executable, "-X", "importtime", str(SCRIPTS[0]), "--help").stderr
     imported = [line.rpartition("|")[2].strip() for line in shown.splitlines()]
     assert imported.index("dora.quiet_start") < imported.index("torch")
 
