@@ -179,6 +179,24 @@ def test_training_is_drawn_where_runs_have_a_table_of_it(tmp_path: Path):
     assert heights[1] > 1.5 * heights[0]
 
 
+def test_each_sub_task_of_training_has_its_own_curves(tmp_path: Path):
+    """In rows of three below the others, also where a run has one more than those beside it."""
+    heights = []
+    for stages in ((), ("reach",), ("reach", "grasp", "lift", "turn")):
+        place = tmp_path / str(len(stages))
+        for name, learner, own in (("a", "affordance", stages), ("b", "none", stages[:3])):
+            write_run(place / "runs" / name, 0, 0.5, guidance=learner)
+            table = ProgressTable(place / "runs" / name / "progress.csv", list(own))
+            for step in range(10, 500, 10):
+                shares = {f"stage/{each}": step / 500 for each in own}
+                table.add({"env_steps": step, "episodes": 1, "success_rate": 0.1} | shares)
+        figure = next(path for path in write_report(place / "runs", place / "out") if path.name == "Toy-v1.png")
+        heights.append(imageio.imread(figure).shape[0])
+    two, three, four = heights
+    assert three - two == pytest.approx(four - three, abs=2)
+    assert three - two == pytest.approx(two / 2, rel=0.2)
+
+
 def test_a_report_has_a_table_a_page_and_a_figure(tmp_path: Path):
     write_run(tmp_path / "runs" / "a", 0, 0.9)
     write_run(tmp_path / "runs" / "b", 0, 0.5, preset="hard")

@@ -2,12 +2,14 @@
 
 import io
 from collections.abc import Sequence
+from math import ceil
 from statistics import mean
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from dora.agents.reports.failures import STAGE
 from dora.agents.reports.run_results import SECONDS_PER_MINUTE, Group, Run, grouped, zero_episodes, zero_shares
 
 COLOURS = {
@@ -33,7 +35,9 @@ GRID = 200
 TRAINING = (
     ("success_rate", "training success"), ("return_mean", "training return"), ("penetration_mm", "overlap [mm]"),
 )  # fmt: skip
-"""Columns of `progress.csv` that are drawn, and their labels."""
+"""Columns of `progress.csv` that are drawn beside those of sub-tasks, and their labels."""
+ACROSS, MOST_STAGES = 3, 12
+"""Axes in a row of a figure, and the largest number of sub-tasks that are drawn [1]."""
 
 
 def smoothed(
@@ -65,7 +69,8 @@ def smoothed(
 def draw_curves(runs: Sequence[Run], env: str, preset: str) -> bytes:
     """A PNG of success and return of greedy evaluations over environment steps and minutes, one line per learner: mean
     and range over seeds; dotted, the success of no correction in the last evaluations. Below, where runs have a
-    `progress.csv`, what happened in training, smoothed as in the paper, before the raw values."""
+    `progress.csv`, what happened in training, smoothed as in the paper, before the raw values: success, return,
+    overlap, and the share of episodes in which each sub-task was done."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -74,13 +79,17 @@ def draw_curves(runs: Sequence[Run], env: str, preset: str) -> bytes:
     groups = {group: members for group, members in grouped(runs).items() if group[:2] == (env, preset)}
     evaluated = {group: some for group, members in groups.items() if (some := [m for m in members if m.curve])}
     trained = {group: some for group, members in groups.items() if (some := [m for m in members if m.progress])}
-    rows = 2 if trained else 1
-    figure, axes = pyplot.subplots(rows, 3, figsize=(13, 0.6 + 3.6 * rows), layout="constrained", squeeze=False)
+    shown = _columns_of(trained)
+    rows = 1 + ceil(len(shown) / ACROSS)
+    figure, axes = pyplot.subplots(rows, ACROSS, figsize=(13, 0.6 + 3.6 * rows), layout="constrained", squeeze=False)
     for axis in axes.flat:
         axis.set_prop_cycle(color=OTHERS)
     colours = _draw_evaluations(axes[0], evaluated)
-    if trained:
-        _draw_training(axes[1], trained, colours)
+    places = list(axes[1:].flat)
+    for axis, (column, label) in zip(places[: len(shown)], shown, strict=True):
+        _draw_training(axis, column, label, trained, colours)
+    for axis in places[len(shown) :]:
+        axis.remove()
     legend = figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=2)
     for text in legend.get_texts():
         text.set_parse_math(False)
@@ -177,19 +186,31 @@ def _draw_evaluations(axes: Any, groups: dict[Group, list[Run]]) -> dict[Group, 
     return colours
 
 
-def _draw_training(axes: Any, groups: dict[Group, list[Run]], colours: dict[Group, Any]) -> None:
-    """Three axes of training: the mean over seeds of smoothed curves, before the raw values of each seed."""
-    for axis, (column, label) in zip(axes, TRAINING, strict=True):
-        for group, members in groups.items():
-            colour, curves = colours.get(group, COLOURS.get(group[2:4])), []
-            at = np.linspace(0, min(np.nanmax(m.progress["env_steps"], initial=0.0) for m in members), GRID)
-            for m in members:
-                steps, values, episodes = (m.progress[name] for name in ("env_steps", column, "episodes"))
-                curves.append(smoothed(at, steps, values, episodes, max(m.budget, 1) * SIGMA / EPOCHS))
-                known = np.isfinite(values)
-                (line,) = axis.plot(steps[known] / 1e3, values[known], color=colour, alpha=0.15, linewidth=0.6)
-                colour = colours[group] = line.get_color()
-            axis.plot(at / 1e3, np.mean(curves, 0), color=colour)
-        axis.set_xlabel("environment steps [1000]")
-        axis.set_ylabel(label)
-        axis.grid(alpha=0.3)
+def _columns_of(groups: dict[Group, list[Run]]) -> list[tuple[str, str]]:
+    """Columns of training that are drawn, and their labels: those of `TRAINING`, and the sub-tasks of any run."""
+    names = dict.fromkeys(name for members in groups.values() for m in members for name in m.progress)
+    stages = [name for name in names if name.startswith(STAGE)][:MOST_STAGES]
+    return [*TRAINING, *((name, f"training {shortened(name.removeprefix(STAGE))}") for name in stages)] if names else []
+
+
+def _draw_training(
+    axis: Any, column: str, label: str, groups: dict[Group, list[Run]], colours: dict[Group, Any]
+) -> None:
+    """One column of training: the mean over seeds of smoothed curves, before the raw values of each seed."""
+    for group, members in groups.items():
+        if not all(column in m.progress for m in members):
+            continue  # the sub-task of another form of the task
+        colour, curves = colours.get(group, COLOURS.get(group[2:4])), []
+        at = np.linspace(0, min(np.nanmax(m.progress["env_steps"], initial=0.0) for m in members), GRID)
+        for m in members:
+            steps, values, episodes = (m.progress[name] for name in ("env_steps", column, "episodes"))
+            curves.append(smoothed(at, steps, values, episodes, max(m.budget, 1) * SIGMA / EPOCHS))
+            known = np.isfinite(values)
+            (line,) = axis.plot(steps[known] / 1e3, values[known], color=colour, alpha=0.15, linewidth=0.6)
+            colour = colours[group] = line.get_color()
+        axis.plot(at / 1e3, np.mean(curves, 0), color=colour)
+    axis.set_xlabel("environment steps [1000]")
+    axis.set_ylabel(label).set_parse_math(False)
+    axis.grid(alpha=0.3)
+    if column.startswith(STAGE):
+        axis.set_ylim(-0.02, 1.02)
