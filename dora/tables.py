@@ -47,12 +47,9 @@ def with_code(text: str) -> Markup:
     return Markup("").join(Markup("<code>%s</code>") % piece if i % 2 else piece for i, piece in enumerate(pieces))
 
 
-_ESCAPED.filters["with_code"] = with_code
-
-
 def html_page(template: str, **values: object) -> str:
-    """A page from a jinja2 template; values are escaped. The filter of templates is `with_code`."""
-    return _ESCAPED.from_string(template).render(values)
+    """A page from a jinja2 template, which may call `with_code`; values are escaped."""
+    return _ESCAPED.from_string(template).render(values, with_code=with_code)
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -52,19 +52,19 @@ img{max-width:100%}h2{margin-top:2em}</style>
 <tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
 {%- endfor %}
 </table>
-<p>{{ note | with_code }}</p>
+<p>{{ with_code(note) }}</p>
 {%- for name, picture in figures %}
 <p><img alt="{{ name }}" src="data:image/png;base64,{{ picture }}"></p>
 {%- endfor %}
 {%- for section in sections %}
-<h2>{{ section.title | with_code }}</h2>
+<h2>{{ with_code(section.title) }}</h2>
 <table>
-<tr>{% for name in section.head %}<th>{{ name | with_code }}</th>{% endfor %}</tr>
+<tr>{% for name in section.head %}<th>{{ with_code(name) }}</th>{% endfor %}</tr>
 {%- for row in section.rows %}
 <tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
 {%- endfor %}
 </table>
-<p>{{ section.note | with_code }}</p>
+<p>{{ with_code(section.note) }}</p>
 {%- endfor %}
 """
 """Template of `report.html`, which needs no other file."""
