@@ -220,7 +220,7 @@ def _flat(corners: Float[np.ndarray, "f 3 3"]) -> np.ndarray:
     """Whether triangles (f, 3 corners, 3) are so flat that their normals are rounding (f,)."""
     edges = corners - np.roll(corners, 1, axis=1)
     longest = (edges**2).sum(-1).max(1)
-    return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) < _FLAT * longest
+    return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) <= _FLAT * longest
 
 
 def _mix(corner: Tensor, share: Tensor) -> Tensor:

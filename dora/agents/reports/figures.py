@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from dora.agents.reports.failures import STAGE
 from dora.agents.reports.run_results import SECONDS_PER_MINUTE, Group, Run, grouped, zero_episodes, zero_shares
+from dora.agents.runs.progress_table import STAGE
 
 COLOURS = {
     ("PPO", "affordance"): "#c0392b",
