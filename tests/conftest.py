@@ -3,13 +3,18 @@
 import gc
 import os
 import random
+import sys
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
+import type_checks
 
 torch.set_num_threads(1)
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # with it each process of a test would compile all modules anew
+sys.dont_write_bytecode = False
+type_checks.install()
 
 LONG = (
     "test_tasks.py", "test_agents_train.py", "test_run_failures.py", "test_adding_a_task.py", "test_nail.py",
@@ -29,6 +34,12 @@ def quick_collections():
     takes three, is ten times quicker."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(autouse=True)
+def types_of_first_calls():
+    """Are checked in each test."""
+    type_checks.next_test()
 
 
 @pytest.fixture(autouse=True)

@@ -1,5 +1,6 @@
 """Intervals of success over seeds and starts, differences on the same starts, and aggregates over tasks."""
 
+import functools
 import importlib
 import warnings
 from collections.abc import Mapping, Sequence
@@ -29,16 +30,10 @@ def crossed_interval(outcomes: Float[np.ndarray, "seeds starts"]) -> Interval:
     Args:
         outcomes: of each seed in the episode of each start.
     """
-    generator = np.random.default_rng(SEED)
-    seeds, starts = outcomes.shape
     if np.ptp(outcomes) == 0:
+        starts = outcomes.shape[1]
         return wilson(round(starts * float(outcomes.mean())), starts)
-    means = [
-        outcomes[np.ix_(generator.integers(seeds, size=seeds), generator.integers(starts, size=starts))].mean()
-        for _ in range(SAMPLES)
-    ]
-    low, high = np.percentile(means, PERCENTILES)
-    return float(low), float(high)
+    return _interval(_means(outcomes, *_drawn(outcomes.shape)))
 
 
 def paired_difference(
@@ -50,14 +45,9 @@ def paired_difference(
         ours: outcomes of each seed for each start.
         theirs: the same of what is compared, such as zero correction (one row).
     """
-    generator = np.random.default_rng(SEED)
-    found = []
-    for _ in range(SAMPLES):
-        starts = generator.integers(ours.shape[1], size=ours.shape[1])
-        sides = [x[np.ix_(generator.integers(len(x), size=len(x)), starts)].mean() for x in (ours, theirs)]
-        found.append(sides[0] - sides[1])
-    low, high = np.percentile(found, PERCENTILES)
-    return float(ours.mean() - theirs.mean()), (float(low), float(high))
+    starts, seeds, others = _drawn((ours.shape[1], len(ours), len(theirs)))
+    interval = _interval(_means(ours, seeds, starts) - _means(theirs, others, starts))
+    return float(ours.mean() - theirs.mean()), interval
 
 
 def difference_of_pairs(
@@ -74,6 +64,31 @@ def difference_of_pairs(
     found = difference.mean()
     interval = (found, found) if np.ptp(difference) == 0 else crossed_interval(difference)
     return float(found), (float(interval[0]), float(interval[1]))
+
+
+@functools.lru_cache(maxsize=16)
+def _drawn(sizes: tuple[int, ...]) -> list[Float[np.ndarray, "samples size"]]:
+    """How often each of so many seeds, starts, ... is drawn in each sample; the draws depend on their numbers alone."""
+    generator = np.random.default_rng(SEED)
+    counts = [np.zeros((SAMPLES, size)) for size in sizes]
+    for sample in range(SAMPLES):
+        for size, count in zip(sizes, counts, strict=True):
+            count[sample] = np.bincount(generator.integers(size, size=size), minlength=size)
+    return counts
+
+
+def _means(
+    outcomes: Float[np.ndarray, "seeds starts"],
+    seeds: Float[np.ndarray, "samples seeds"],
+    starts: Float[np.ndarray, "samples starts"],
+) -> Float[np.ndarray, " samples"]:
+    """Mean of each sample, in which seeds and starts were drawn so often."""
+    return ((seeds @ outcomes) * starts).sum(1) / outcomes.size
+
+
+def _interval(means: Float[np.ndarray, " samples"]) -> Interval:
+    low, high = np.percentile(means, PERCENTILES)
+    return float(low), float(high)
 
 
 def mean_of_curve(curve: Sequence[Mapping[str, float]], budget: int) -> float | None:
