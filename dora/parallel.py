@@ -13,7 +13,7 @@ import tempfile
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import (
@@ -22,8 +22,10 @@ from multiprocessing import (
     forkserver,
     get_all_start_methods,
     get_context,
+    get_start_method,
     parent_process,
     resource_tracker,
+    set_start_method,
 )
 from multiprocessing.connection import Connection
 from multiprocessing.util import Finalize
@@ -146,6 +148,11 @@ class WorkerPool(Generic[Case, Result]):
             raise
         return [found[i] for i in range(len(cases))]
 
+    def warm_up(self) -> None:
+        """Begin to import, beside other work, what the processes will need; returns at once."""
+        if self.processes > 0:
+            warm_up(self._task.func)
+
     def close(self) -> None:
         """End the processes, whatever they are doing; `map` may start new ones."""
         if self._executor is not None and self._alive is not None:
@@ -166,7 +173,8 @@ class WorkerPool(Generic[Case, Result]):
             if self._executor is None:
                 theirs, self._alive = Pipe(duplex=False)
                 context = _context(self._task.func.__module__)
-                self._executor = ProcessPoolExecutor(self.processes, context, _begin, (theirs, self._task))
+                arguments = theirs, dict(os.environ), self._task
+                self._executor = ProcessPoolExecutor(self.processes, context, _begin, arguments)
             return self._executor.submit(_work, cases)
 
 
@@ -313,13 +321,35 @@ def _context(module: str) -> Any:
     return context
 
 
+@contextlib.contextmanager
+def started_as_ours(module: str) -> Iterator[None]:
+    """Processes that a library starts by Python's default method are forked from the server of ours meanwhile.
+
+    Args:
+        module: what they need, which the server imports, too, if it begins now.
+    """
+    method, before = _context(module).get_start_method(), get_start_method(allow_none=True)
+    set_start_method(method, force=True)
+    try:
+        yield
+    finally:
+        set_start_method(before, force=True)
+
+
 _task: Callable[[], Callable[[Any], Any]] | None = None
 """In a worker process: gives its task, which the first call makes."""
 
 
-def _begin(alive: Connection, make_task: Callable[[], Callable[[Any], Any]]) -> None:
+def take_environment(variables: Mapping[str, str]) -> None:
+    """Give a worker process the environment of the one that wants it; its server may have begun with another."""
+    os.environ.clear()
+    os.environ.update(variables)
+
+
+def _begin(alive: Connection, environment: dict[str, str], make_task: Callable[[], Callable[[Any], Any]]) -> None:
     """Start of a worker process; the task is made with the first cases, where an exception reaches the caller."""
     global _task
+    take_environment(environment)
     _task = functools.cache(make_task)
     torch.set_num_threads(1)
     threading.Thread(target=_end_with, args=(alive,), daemon=True).start()

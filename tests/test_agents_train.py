@@ -1,9 +1,11 @@
 """Whole runs on the fake task: learning, resuming, interruptions, workers."""
 
+import contextlib
 import csv
 import dataclasses
 import functools
 import json
+import multiprocessing
 import os
 import re
 import signal
@@ -14,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import torch
 from fake_task import PointMass
@@ -33,6 +36,7 @@ from dora.agents.runs.progress_table import read_progress
 from dora.agents.runs.run_folder import RunFolder
 from dora.agents.runs.trainer import Trainer
 from dora.errors import InputError
+from dora.parallel import warm_up
 
 RESULT_KEYS = [
     *("env", "agent", "guidance", "preset", "seed", "commit", "task_config"),
@@ -51,6 +55,14 @@ class Drifting(PointMass):
         if int(self.elapsed_steps.max()) == 5:
             raise InputError("The action of environment 3 is NaN: send finite numbers.")
         return super().step(action)
+
+
+class Placed(PointMass):
+    """A task that can be made only where a variable of the environment is set."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        assert os.environ.get("DORA_TEST") == "now"
+        super().__init__(*args, **kwargs)
 
 
 def weights(path: Path) -> dict[str, Tensor]:
@@ -244,6 +256,23 @@ def test_batches_collected_ahead_are_of_the_policy_before():
     assert [round(mean) for mean in means] == [0, 0, 1, 2]
 
 
+@pytest.mark.skipif("forkserver" not in multiprocessing.get_all_start_methods(), reason="no processes can be forked")
+def test_workers_are_forked_from_a_server_and_have_the_environment_of_now(monkeypatch: pytest.MonkeyPatch):
+    """It has imported what they need; what others start is started as before."""
+    warm_up(Rollouts)  # without the variable, unless it runs already
+    monkeypatch.setenv("DORA_TEST", "now")
+    before, policy = multiprocessing.get_start_method(allow_none=True), PPO(SMALL_PPO, 4, 2, 1000).policy
+    make, rules = functools.partial(Placed, 4), TrainingRules()
+    with Rollouts(make, policy, workers=1, num_envs=4, rollout=8, seeds=[0], rules=rules) as rollouts:
+        assert rollouts.collect().shape == (4, 8)
+        (worker,) = (psutil.Process(process.pid) for process in rollouts._processes)
+        server = worker.parent()
+        assert server is not None
+        assert server.ppid() == os.getpid()
+        assert worker.cmdline() == server.cmdline()
+    assert multiprocessing.get_start_method(allow_none=True) == before
+
+
 @pytest.mark.parametrize("ahead", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_message_of_a_failing_worker_arrives(ahead: bool):
     learner = PPO(SMALL_PPO, 4, 2, 1000)
@@ -256,12 +285,16 @@ def test_the_message_of_a_failing_worker_arrives(ahead: bool):
 
 
 def children() -> set[str]:
-    """Python processes started by this one, but for the interpreter's own, which end with it."""
-    out = subprocess.run(
-        ["ps", "-ww", "--ppid", str(os.getpid()), "-o", "pid=,args="], capture_output=True, text=True, check=True
-    ).stdout
-    own = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
-    return {line.strip() for line in out.splitlines() if "python" in line and not any(name in line for name in own)}
+    """Python processes started by this one, directly or from its server, but for the interpreter's own, which end with
+    it: those that keep track of resources, and the server."""
+    this, found = psutil.Process(), set()
+    for process in this.children(recursive=True):
+        with contextlib.suppress(psutil.Error):  # it has just ended
+            words, server = " ".join(process.cmdline()), process.ppid() == this.pid
+            own = "resource_tracker" in words or (server and "multiprocessing.forkserver" in words)
+            if "python" in words and not own and process.status() != psutil.STATUS_ZOMBIE:
+                found.add(f"{process.pid} {words}")
+    return found
 
 
 SCRIPT = """

@@ -217,12 +217,11 @@ def test_claims_are_judged_when_all_their_runs_are_there(tmp_path: Path):
     close = {row[0]: row[2:] for row in table(tmp_path / "close", "The paper's claims")}
     assert close["affordance gains on average over tasks 1 to 3 and both learners"][1] == "undecided"
     whole(tmp_path / "all", gain=0.2)
-    claims = {row[0]: row[2:] for row in table(tmp_path / "all", "The paper's claims")}
+    found = {section.title: section.rows for section in sections(find_runs(tmp_path / "all"))}
+    claims = {row[0]: row[2:] for row in found["The paper's claims"]}
     assert claims["affordance gains on average over tasks 1 to 3 and both learners"][1] == "reproduced"
     assert claims["affordance gains on the jug with PPO"][1] == "not reproduced"
-    above = {
-        row[0]: row[1:] for row in table(tmp_path / "all", "Both learners with affordance beside the paper's best")
-    }
+    above = {row[0]: row[1:] for row in found["Both learners with affordance beside the paper's best"]}
     assert above["DoraHammer-v1"] == ["75.1 (SAC)", above["DoraHammer-v1"][1], "yes"]
     assert above["DoraJug-v1"][-1] == "undecided"  # 68 of 65.6 %
     assert above["DoraMicrowave-v1"][-1] == "undecided"

@@ -13,7 +13,7 @@ from dora.tasks import cube
 from dora.tasks.cube import CubeConfig
 from dora.tasks.mdp.snapshot import Snapshot, derived
 
-STARTS = 100
+STARTS = 40
 """Random starts of the scripted grasp."""
 TERMS = cube.terms(CubeConfig()).terms
 """Terms of the reward with the task's own numbers."""

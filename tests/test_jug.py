@@ -15,7 +15,7 @@ from dora.tasks import jug
 from dora.tasks.jug import JugConfig
 from dora.tasks.mdp.snapshot import CONTACT_CLASSES, Snapshot
 
-STARTS = 60
+STARTS = 40
 """Random starts of the scripted grasp."""
 CONFIG = JugConfig()
 """The task's own numbers."""

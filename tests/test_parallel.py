@@ -28,6 +28,19 @@ def make_deadly() -> Callable[[int], int]:
     return lambda case: os._exit(3)
 
 
+def make_reading(variable: str) -> Callable[[int], str | None]:
+    """A task that tells a variable of the environment."""
+    return lambda case: os.environ.get(variable)
+
+
+def test_processes_have_the_environment_of_when_they_start(monkeypatch: pytest.MonkeyPatch):
+    """Their server has that of when it started."""
+    for value in ("a", "b", None):
+        monkeypatch.setenv("DORA_TEST", value) if value else monkeypatch.delenv("DORA_TEST")
+        with WorkerPool(make_reading, ("DORA_TEST",), 1) as pool:
+            assert pool.map([0]) == [value]
+
+
 @pytest.mark.parametrize("processes", [1, 2, 3])
 def test_results_come_in_the_order_of_the_cases_whoever_does_them(processes: int):
     told = []

@@ -124,39 +124,42 @@ from dora.errors import InputError
 from dora.sim import robots
 from mani_skill.agents.registration import REGISTERED_AGENTS
 
-assert "spoiled" not in REGISTERED_AGENTS and "diana7_hit" in REGISTERED_AGENTS
-for ask in (
-    lambda: robots.register_robot("spoiled"),
-    lambda: robots.Spoiled,
-    lambda: gym.make("Empty-v1", robot_uids="spoiled", render_backend="none"),
-    lambda: gym.make("DoraCube-v1", robot_uids="spoiled"),
-):
-    try:
-        ask()
-    except InputError as error:
-        print("refused:", error)
+for name in {names}:
+    assert name not in REGISTERED_AGENTS and "diana7_hit" in REGISTERED_AGENTS
+    for ask in (
+        lambda: robots.register_robot(name),
+        lambda: getattr(robots, name.capitalize()),
+        lambda: gym.make("Empty-v1", robot_uids=name, render_backend="none"),
+        lambda: gym.make("DoraCube-v1", robot_uids=name),
+    ):
+        try:
+            ask()
+        except InputError as error:
+            print("refused", name, error)
 """
 FAULTS = {
-    "unknown key": lambda text: text.replace("[arm]", "[arm]\nstiffnes = 1.0", 1),
-    "a list for a table": lambda text: "fingers = [1]\n" + "\n".join(
+    "unknown": lambda text: text.replace("[arm]", "[arm]\nstiffnes = 1.0", 1),
+    "listed": lambda text: "fingers = [1]\n" + "\n".join(
         line for line in text.split("[fingers.thumb]")[0].splitlines()
     ),
-    "no TOML": lambda text: text.replace("[arm]", "[arm", 1),
+    "unread": lambda text: text.replace("[arm]", "[arm", 1),
 }  # fmt: skip
+"""Changes of a description, by the names of their robots: an unknown key, a list for a table, no TOML."""
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_broken_folder_is_left_out_with_one_warning_and_refused_by_name(tmp_path, fault):
-    file = copied("spoiled", tmp_path) / "robot.toml"
-    file.write_text(FAULTS[fault](file.read_text()))
-    result = run(ASKED, DORA_ROBOTS=str(tmp_path))
+def test_a_broken_folder_is_left_out_with_one_warning_and_refused_by_name(tmp_path):
+    for name, fault in FAULTS.items():
+        file = copied(name, tmp_path) / "robot.toml"
+        file.write_text(fault(file.read_text()))
+    result = run(ASKED.format(names=list(FAULTS)), DORA_ROBOTS=str(tmp_path))
     assert result.returncode == 0, result.stderr
-    assert result.stderr.count("UserWarning: the robot 'spoiled' is left out") == 1
-    (warning,) = [line for line in result.stderr.splitlines() if "is left out" in line]
-    assert str(file) in warning
-    said = result.stdout.strip().splitlines()
-    assert len(said) == 4
-    assert all(line.startswith("refused: ") and line.removeprefix("refused: ") in warning for line in said)
+    for name in FAULTS:
+        assert result.stderr.count(f"UserWarning: the robot '{name}' is left out") == 1
+        (warning,) = [line for line in result.stderr.splitlines() if f"'{name}' is left out" in line]
+        assert str(tmp_path / name / "robot.toml") in warning
+        said = [line for line in result.stdout.splitlines() if line.startswith(f"refused {name} ")]
+        assert len(said) == 4
+        assert all(line.removeprefix(f"refused {name} ") in warning for line in said)
 
 
 def test_a_folder_that_comes_later_is_found_by_name(tmp_path, monkeypatch, registered):

@@ -163,7 +163,9 @@ def test_a_worker_that_dies_leaves_a_run_that_goes_on(tmp_path: Path, ahead: boo
     ("what", "sentence"),
     [
         ("raise", r"Worker 0 failed with ValueError: one line\nanother line."),
-        ("raise in a reset", r"Worker 0 failed with ValueError: one line\nanother line."),
+        pytest.param(
+            "raise in a reset", r"Worker 0 failed with ValueError: one line\nanother line.", marks=pytest.mark.slow
+        ),
         ("raise at the start", r"Worker 0 failed with ValueError: one line\nanother line."),
         ("die at the start", "A worker process died while it started: worker 0 (ended by SIGKILL)."),
     ],

@@ -165,7 +165,7 @@ def touching_itself(task: DoraEnv) -> Tensor:
     return torch.tensor([any(pair <= links for pair in pairs) for pairs in found])
 
 
-@pytest.mark.parametrize("which", [[2], [0, 1, 3, 4, 5]])
+@pytest.mark.parametrize("which", [[2], pytest.param([0, 1, 3, 4, 5], marks=pytest.mark.slow)])
 def test_partial_reset_leaves_the_others_bit_identical(batch: DoraEnv, which: list[int]):
     rows = torch.tensor(which)
     others = torch.tensor([i for i in range(BATCH) if i not in which])

@@ -25,7 +25,7 @@ from dora.agents.collecting.ray_collector import explained, ray_collector, whole
 from dora.agents.collecting.task_env import Task, TaskEnv, TaskFactory, TrainingRules
 from dora.agents.learners.networks import Policy
 from dora.errors import InputError, RunFailure, WorkerFailure, said
-from dora.parallel import name_leftovers, name_of_process, signals_blocked
+from dora.parallel import name_leftovers, name_of_process, signals_blocked, started_as_ours, take_environment
 
 Result = TypeVar("Result")
 SHUTDOWN_SECONDS = 10.0
@@ -84,7 +84,10 @@ def _reported(report: Path) -> Iterator[None]:
         raise SystemExit(1) from None
 
 
-def _make_worker_env(make_task: TaskFactory, report: Path, seed: int, rules: TrainingRules, nice: int) -> WorkerTaskEnv:
+def _make_worker_env(
+    make_task: TaskFactory, report: Path, seed: int, rules: TrainingRules, nice: int, environment: dict[str, str]
+) -> WorkerTaskEnv:
+    take_environment(environment)
     torch.set_num_threads(1)
     os.nice(nice)
     torch.manual_seed(seed)
@@ -172,8 +175,9 @@ class Rollouts:
                 auto_register_policy_transforms=False,
             )
         else:
+            nice, environment = LESS_URGENT if ahead else 0, dict(os.environ)
             factories = [
-                functools.partial(_make_worker_env, make_task, report, seed, rules, LESS_URGENT if ahead else 0)
+                functools.partial(_make_worker_env, make_task, report, seed, rules, nice, environment)
                 for report, seed in zip(self._reports, seeds, strict=True)
             ]
             self._collector = self._started(
@@ -199,7 +203,7 @@ class Rollouts:
         """The collector of worker processes, made in a thread that blocks signals for them, while this one does not."""
 
         def make_quietly() -> MultiSyncCollector:
-            with signals_blocked():
+            with signals_blocked(), started_as_ours(__name__):
                 return make()
 
         before = set(active_children())

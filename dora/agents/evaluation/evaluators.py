@@ -39,6 +39,7 @@ class Evaluators:
     def __init__(self, make_task: MakeTask, config: RunConfig, episodes: int | None = None):
         self._own, self._config = _Evaluator(make_task, config), config
         self._helpers = WorkerPool(_Evaluator, (make_task, config), max(config.workers, 1) - 1)
+        self._helpers.warm_up()
         self.env = self._own.env(min(episodes or config.eval_envs, config.eval_envs))
         self.sizes, self.agents = self.env.sizes, self.env.agents
 
