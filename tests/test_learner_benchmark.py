@@ -51,9 +51,10 @@ def test_ppo_in_plain_torch_takes_the_same_steps():
 
 
 def test_sac_in_plain_torch_takes_the_same_steps():
-    """With a pull that falls meanwhile."""
+    """With a pull and learning rates that fall meanwhile."""
     pull = {"prior": 0.5, "prior_last": 1e-3, "prior_steps": 600}
-    config = config_of("sac", warmup=64, critic_only=4, updates_per_step=1 / 8, batch=32, n_step=3, **pull)
+    rates = {"learning_rate_last": 0.1, "learning_rate_steps": 500}
+    config = config_of("sac", warmup=64, critic_only=4, updates_per_step=1 / 8, batch=32, n_step=3, **pull, **rates)
     torch.manual_seed(0)
     sac = SAC(config.learner, *SIZES, 1000)
     plain, first = PlainSAC(sac, *SIZES), copy.deepcopy(sac.actor)

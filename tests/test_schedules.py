@@ -1,4 +1,4 @@
-"""The pull of mean actions towards no correction, and the ceiling of the noise, over the course of a run."""
+"""The pull of mean actions towards no correction, the ceiling of the noise, and learning rates over a run."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from test_agents_multi import SETTINGS, SIZES, batch_of, learner_of
 from dora.agents.config import PPOConfig, SACConfig
 from dora.agents.learners.networks import last_layer
 from dora.agents.learners.ppo import PPO
-from dora.agents.learners.schedules import loudest, pull
+from dora.agents.learners.schedules import loudest, pull, rates_left
 from dora.agents.runs.recommended import recommended
 
 
@@ -18,6 +18,14 @@ def test_it_falls_geometrically_with_the_steps():
     )
     assert pull(SACConfig(prior=0.05), 5000.0) == 0.05
     assert pull(SACConfig(prior=0.0, prior_last=0.01), 0.0) == 0.0  # of runs that have no prior
+
+
+def test_learning_rates_of_sac_fall_evenly_after_a_third_of_the_steps():
+    config = SACConfig(learning_rate_last=0.1, learning_rate_steps=900)
+    assert [rates_left(config, steps) for steps in (0.0, 300.0, 600.0, 900.0, 5000.0)] == pytest.approx(
+        [1.0, 1.0, 0.55, 0.1, 0.1]
+    )
+    assert rates_left(SACConfig(), 1e6) == 1.0
 
 
 def test_the_prior_pulls_mean_actions_to_no_correction():

@@ -113,6 +113,11 @@ class SACConfig:
     """Learning rate of the actor."""
     learning_rate_alpha: float = 1e-3
     """Learning rate of the temperature."""
+    learning_rate_last: float | None = None
+    """Share of the rates of critics and actor that is left from `learning_rate_steps` on; they fall to it evenly from a
+    third of these steps on. None: they do not change."""
+    learning_rate_steps: int = 300_000
+    """Environment steps after which `learning_rate_last` is reached."""
     alpha: float = 1e-3
     """First temperature, in units of mean reward per nat."""
     target_entropy: float = -1.0
@@ -152,9 +157,11 @@ CONSTANT_PULL = {"prior_last": None, "prior_steps": 100_000}
 """Settings of a pull that does not change."""
 CONSTANT_NOISE = {"log_std_last": None, "log_std_steps": 1_000_000}
 """Settings of noise that no schedule bounds."""
+CONSTANT_RATES = {"learning_rate_last": None, "learning_rate_steps": 300_000}
+"""Settings of learning rates that do not change."""
 NEUTRAL_LEARNER = {
     **{name: {"prior": 0.0, **CONSTANT_PULL, **CONSTANT_NOISE} for name in ("ppo", "mappo", "happo")},
-    "sac": CONSTANT_PULL,
+    "sac": {**CONSTANT_PULL, **CONSTANT_RATES},
 }
 """The same of settings of each learner."""
 TRAINING = frozenset((

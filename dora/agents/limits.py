@@ -56,6 +56,8 @@ LEARNER = {
     "learning_rate_max": RATE,
     "learning_rate_actor": RATE,
     "learning_rate_alpha": RATE,
+    "learning_rate_last": SHARE,
+    "learning_rate_steps": (1, 10**12),
     "updates_per_step": RATE,
     "grad_norm": (1e-12, 1e9),
     "clip": (1e-6, 0.999),  # TorchRL takes log(1 - clip)

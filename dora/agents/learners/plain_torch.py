@@ -15,7 +15,7 @@ from dora.agents.config import PPOConfig, SACConfig
 from dora.agents.learners.networks import TANH_MARGIN, Critic, GaussianActor, Normaliser, TanhActor
 from dora.agents.learners.ppo import ADAM_EPSILON, PPO, adapted, excess, squared, standardised
 from dora.agents.learners.sac import ACTOR_PERIOD, SAC
-from dora.agents.learners.schedules import loudest, pull
+from dora.agents.learners.schedules import loudest, pull, rates_left
 
 Batch = dict[str, Tensor]
 """Transitions (N, T, ...): observation, action, log_prob, reward, done, terminated, and next observation as `next`."""
@@ -146,6 +146,9 @@ class PlainSAC:
             return 0
         before = self.updates
         self.due += batch["reward"].numel() * self.config.updates_per_step
+        left, c = rates_left(self.config, float(self.added)), self.config
+        for name, rate in (("critic", c.learning_rate), ("actor", c.learning_rate_actor)):
+            self.adams[name].param_groups[0]["lr"] = left * rate
         while self.due >= 1.0:
             self.due -= 1.0
             rows = torch.randint(min(self.added, self.config.capacity), (self.config.batch,))

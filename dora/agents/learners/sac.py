@@ -14,7 +14,7 @@ from dora.agents.config import SACConfig
 from dora.agents.learners.finite import check_loss
 from dora.agents.learners.networks import Critic, LatestOutput, Normaliser, Policy, TanhActor, for_loss
 from dora.agents.learners.replay import Replay
-from dora.agents.learners.schedules import pull
+from dora.agents.learners.schedules import pull, rates_left
 from dora.agents.learners.stopping import Stop, never
 
 CRITICS = 2
@@ -134,6 +134,7 @@ class SAC:
         if self.replay.added < self.config.warmup:
             return {"replay": float(len(self.replay))}
         self.due += batch.numel() * self.config.updates_per_step
+        self._set_rates()
         critic: list[Tensor] = []
         actor: list[Tensor] = []
         while self.due >= 1.0 and not stop():
@@ -145,12 +146,20 @@ class SAC:
             self._follow()
             self.updates += 1
         values = {"updates": float(self.updates), "replay": float(len(self.replay))}
+        values["learning_rate"] = float(self.optimisers["actor_adam"].param_groups[0]["lr"])
         if critic:
             values["qvalue"] = float(torch.stack(critic).mean())
         if actor:
             names = ("actor", "alpha", "entropy", "action_std", "correction")
             values |= dict(zip(names, torch.stack(actor).mean(0).tolist(), strict=True))
         return values
+
+    def _set_rates(self) -> None:
+        left = rates_left(self.config, float(self.replay.added))
+        rates = {"actor_adam": self.config.learning_rate_actor, "critic_adam": self.config.learning_rate}
+        for name, rate in rates.items():
+            for group in self.optimisers[name].param_groups:
+                group["lr"] = left * rate
 
     @torch.no_grad()
     def _sample(self) -> TensorDict:

@@ -1,4 +1,4 @@
-"""What changes over the course of a run: the pull towards no correction, and how much is explored."""
+"""What changes over the course of a run: the pull towards no correction, exploration, and learning rates."""
 
 from dora.agents.config import PPOConfig, SACConfig
 
@@ -17,6 +17,23 @@ def pull(config: PPOConfig | SACConfig, steps: float) -> float:
     if config.prior_last is None or config.prior == 0:
         return config.prior
     return config.prior * (config.prior_last / config.prior) ** min(steps / config.prior_steps, 1.0)
+
+
+def rates_left(config: SACConfig, steps: float) -> float:
+    """Share of the learning rates of critics and actor.
+
+    It is 1, or falls evenly to `learning_rate_last` at `learning_rate_steps`, from a third of these steps on. By how
+    much the noise of single gradient steps moves a policy to and fro in the end is proportional to it.
+
+    Args:
+        config: settings of the learner.
+        steps: environment steps that were learned from so far.
+    """
+    if config.learning_rate_last is None:
+        return 1.0
+    begin = config.learning_rate_steps / 3
+    fallen = min(max((steps - begin) / (config.learning_rate_steps - begin), 0.0), 1.0)
+    return 1.0 + fallen * (config.learning_rate_last - 1.0)
 
 
 def loudest(config: PPOConfig, steps: float) -> float:
