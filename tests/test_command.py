@@ -175,7 +175,7 @@ if __name__ == "__main__":
 """A program that looks at the registry in a process of its own."""
 
 
-@pytest.mark.parametrize("words", [[], ["run", "--total-steps", "1000", "--episodes", "20"]])
+@pytest.mark.parametrize("words", [[], pytest.param(["run", "--total-steps", "1000"], marks=pytest.mark.slow)])
 def test_the_import_registers_everything_in_a_process_that_a_command_starts(tmp_path: Path, words: list[str]):
     """Whose own command line may be shorter than the arguments that it gets."""
     (tmp_path / "dora").write_text(SPAWNING)
@@ -225,7 +225,9 @@ def test_without_maniskill_one_sentence_says_how_to_add_it(tmp_path: Path):
     assert "ManiSkillMissingError: ManiSkill is not installed" in imported.stderr.splitlines()[-1]
 
 
-@pytest.mark.parametrize(("module", "command"), [("sapien", "run"), ("torchrl", "bench")])
+@pytest.mark.parametrize(
+    ("module", "command"), [("sapien", "run"), pytest.param("torchrl", "bench", marks=pytest.mark.slow)]
+)
 def test_without_a_library_of_the_system_one_sentence_says_how_to_add_it(tmp_path: Path, module: str, command: str):
     reason = "libX11.so.6: cannot open shared object file: No such file or directory"
     (tmp_path / f"{module}.py").write_text(f"raise ImportError({reason!r})")

@@ -74,7 +74,9 @@ STOCK = "runpy.run_module('mani_skill.examples.demo_robot', run_name='__main__')
 OURS = f"dora.sim.can_render = lambda: True; runpy.run_path({str(DEMO)!r}, run_name='__main__')"
 
 
-@pytest.mark.parametrize("way", [STOCK, OURS], ids=["ManiSkill's module", "our example"])
+@pytest.mark.parametrize(
+    "way", [STOCK, pytest.param(OURS, marks=pytest.mark.slow)], ids=["ManiSkill's module", "our example"]
+)
 def test_maniskills_demo_shows_the_robot(way):
     """All of `demo_robot` runs but its window, which needs a screen, and without a Vulkan driver its pictures."""
     code = WITHOUT_SCREEN.format(driver=can_render()) + way
