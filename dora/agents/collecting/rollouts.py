@@ -175,11 +175,9 @@ class Rollouts:
                 auto_register_policy_transforms=False,
             )
         else:
-            nice, environment = LESS_URGENT if ahead else 0, dict(os.environ)
-            factories = [
-                functools.partial(_make_worker_env, make_task, report, seed, rules, nice, environment)
-                for report, seed in zip(self._reports, seeds, strict=True)
-            ]
+            settings = rules, LESS_URGENT if ahead else 0, dict(os.environ)
+            each = zip(self._reports, seeds, strict=True)
+            factories = [functools.partial(_make_worker_env, make_task, *own, *settings) for own in each]
             self._collector = self._started(
                 functools.partial(
                     _Workers,
