@@ -89,6 +89,21 @@ def test_an_interval_over_seeds_and_starts_is_wider_than_one_over_episodes():
     assert crossed_interval(np.zeros((3, 50))) == pytest.approx((0.0, 0.071), abs=1e-3)
 
 
+def test_intervals_are_the_same_whatever_is_held_at_once(monkeypatch: pytest.MonkeyPatch):
+    generator = np.random.default_rng(3)
+    ours, theirs = (generator.random((3, 400)) < 0.9).astype(float), (generator.random((1, 400)) < 0.7).astype(float)
+    found = []
+    for most in (statistics.BLOCK, 5000, 1):
+        monkeypatch.setattr(statistics, "BLOCK", most)
+        found.append((crossed_interval(ours), paired_difference(ours, theirs)))
+    assert found[0] == found[1] == found[2]
+    draws = np.random.default_rng(statistics.SEED)
+    means = [
+        ours[draws.integers(3, size=3)][:, draws.integers(400, size=400)].mean() for _ in range(statistics.SAMPLES)
+    ]
+    assert found[0][0] == pytest.approx(np.percentile(means, statistics.PERCENTILES), abs=1e-12)
+
+
 def test_differences_on_the_same_starts_have_a_narrow_interval():
     """Where every start but five goes alike, the difference is those five, however the starts differ."""
     ours = np.tile(np.arange(200) % 2, (1, 1)).astype(float)

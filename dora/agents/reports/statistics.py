@@ -3,7 +3,7 @@
 import functools
 import importlib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,12 @@ SEED = 0
 PERCENTILES = (2.5, 97.5)
 """Ends of an interval [%]."""
 
+BLOCK = 2_000_000
+"""Most numbers of draws that are held at once."""
 Interval = tuple[float, float]
 """Its ends."""
+Counts = list[Float[np.ndarray, "samples size"]]
+"""How often each seed, start, ... is in some of the samples."""
 
 
 def crossed_interval(outcomes: Float[np.ndarray, "seeds starts"]) -> Interval:
@@ -33,7 +37,7 @@ def crossed_interval(outcomes: Float[np.ndarray, "seeds starts"]) -> Interval:
     if np.ptp(outcomes) == 0:
         starts = outcomes.shape[1]
         return wilson(round(starts * float(outcomes.mean())), starts)
-    return _interval(_means(outcomes, *_drawn(outcomes.shape)))
+    return _interval([_means(outcomes, seeds, starts) for seeds, starts in _drawn(outcomes.shape)])
 
 
 def paired_difference(
@@ -45,9 +49,9 @@ def paired_difference(
         ours: outcomes of each seed for each start.
         theirs: the same of what is compared, such as zero correction (one row).
     """
-    starts, seeds, others = _drawn((ours.shape[1], len(ours), len(theirs)))
-    interval = _interval(_means(ours, seeds, starts) - _means(theirs, others, starts))
-    return float(ours.mean() - theirs.mean()), interval
+    drawn = _drawn((ours.shape[1], len(ours), len(theirs)))
+    found = [_means(ours, seeds, starts) - _means(theirs, others, starts) for starts, seeds, others in drawn]
+    return float(ours.mean() - theirs.mean()), _interval(found)
 
 
 def difference_of_pairs(
@@ -66,15 +70,27 @@ def difference_of_pairs(
     return float(found), (float(interval[0]), float(interval[1]))
 
 
-@functools.lru_cache(maxsize=16)
-def _drawn(sizes: tuple[int, ...]) -> list[Float[np.ndarray, "samples size"]]:
-    """How often each of so many seeds, starts, ... is drawn in each sample; the draws depend on their numbers alone."""
+def _drawn(sizes: tuple[int, ...]) -> Iterable[Counts]:
+    """How often each of so many seeds, starts, ... is drawn in each sample, which depends on their numbers alone: kept
+    for the next call, or in blocks of samples where it is too much."""
+    return _kept(sizes) if SAMPLES * sum(sizes) <= BLOCK else _blocks(sizes)
+
+
+@functools.lru_cache(maxsize=8)
+def _kept(sizes: tuple[int, ...]) -> list[Counts]:
+    return list(_blocks(sizes))
+
+
+def _blocks(sizes: tuple[int, ...]) -> Iterator[Counts]:
     generator = np.random.default_rng(SEED)
-    counts = [np.zeros((SAMPLES, size)) for size in sizes]
-    for sample in range(SAMPLES):
-        for size, count in zip(sizes, counts, strict=True):
-            count[sample] = np.bincount(generator.integers(size, size=size), minlength=size)
-    return counts
+    most = max(BLOCK // sum(sizes), 1)
+    for first in range(0, SAMPLES, most):
+        rows = min(most, SAMPLES - first)
+        counts = [np.zeros((rows, size)) for size in sizes]
+        for row in range(rows):
+            for size, count in zip(sizes, counts, strict=True):
+                count[row] = np.bincount(generator.integers(size, size=size), minlength=size)
+        yield counts
 
 
 def _means(
@@ -86,8 +102,8 @@ def _means(
     return ((seeds @ outcomes) * starts).sum(1) / outcomes.size
 
 
-def _interval(means: Float[np.ndarray, " samples"]) -> Interval:
-    low, high = np.percentile(means, PERCENTILES)
+def _interval(means: Sequence[Float[np.ndarray, " samples"]]) -> Interval:
+    low, high = np.percentile(np.concatenate(means), PERCENTILES)
     return float(low), float(high)
 
 
