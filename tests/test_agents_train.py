@@ -256,7 +256,6 @@ def test_batches_collected_ahead_are_of_the_policy_before():
     assert [round(mean) for mean in means] == [0, 0, 1, 2]
 
 
-@pytest.mark.skipif("forkserver" not in multiprocessing.get_all_start_methods(), reason="no processes can be forked")
 def test_workers_are_forked_from_a_server_and_have_the_environment_of_now(monkeypatch: pytest.MonkeyPatch):
     """It has imported what they need; what others start is started as before."""
     warm_up(Rollouts)  # without the variable, unless it runs already

@@ -26,9 +26,9 @@ ROBOT = load_robot("diana7_hit")
 COUNT = 16
 SMALL = {
     "NUM": 4, "BATCHES": (2, 4), "ROWS": (1, 4), "SUBDIVISIONS": (0, 1), "PART_REPEATS": 20, "PART_ROWS": 4,
-    "REFERENCE_ROWS": 1, "REFERENCE_REPEATS": 1, "REPEATS": 2,
+    "REFERENCE_ROWS": 1, "REFERENCE_REPEATS": 1,
 }  # fmt: skip
-"""Constants of a benchmark of a second."""
+"""Constants of a short benchmark; of each piece the fastest of as many measurements counts as ever."""
 MADE = {
     "distance_region": ("distance", "region"),
     "closure": ("closure",),
@@ -74,7 +74,7 @@ def test_all_rates_and_times_are_positive_and_fit_together(measured: GraspBenchm
 def test_shares_of_a_step_are_shares(measured: GraspBenchmark):
     assert measured.shares.keys() == {*PARTS, "rest"}
     assert all(0 <= share < 1 for share in measured.shares.values())
-    assert 0.5 < sum(measured.shares.values()) < 2  # other programs disturb so short a measurement
+    assert sum(measured.shares.values()) == pytest.approx(1, abs=0.3)  # other programs disturb so short a measurement
 
 
 def test_the_reference_is_slower_by_far(measured: GraspBenchmark):
