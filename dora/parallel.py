@@ -195,7 +195,8 @@ def run_cases(
     count = min(processes or available_cores(), -(-len(cases) // chunk))
     report = progress or (lambda done, total: None)
     if count <= 1:
-        return WorkerPool(factory, arguments, 0).map(cases, factory(*arguments), report)
+        with one_thread():  # as in the processes: products on more threads are rounded otherwise
+            return WorkerPool(factory, arguments, 0).map(cases, factory(*arguments), report)
     with WorkerPool(factory, arguments, count) as pool:
         return pool.map(cases, progress=report, chunk=chunk, patience=patience)
 

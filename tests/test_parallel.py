@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
 from dora.errors import FAILED, WorkerFailure, command
 from dora.parallel import DIED, WorkerPool, run_cases
@@ -33,6 +34,11 @@ def make_reading(variable: str) -> Callable[[int], str | None]:
     return lambda case: os.environ.get(variable)
 
 
+def make_counting() -> Callable[[int], int]:
+    """A task that tells the number of threads."""
+    return lambda case: torch.get_num_threads()
+
+
 def test_processes_have_the_environment_of_when_they_start(monkeypatch: pytest.MonkeyPatch):
     """Their server has that of when it started."""
     for value in ("a", "b", None):
@@ -50,6 +56,18 @@ def test_results_come_in_the_order_of_the_cases_whoever_does_them(processes: int
     assert [done for done, _ in told] == sorted(done for done, _ in told)
     assert len({process for _, process in found}) <= processes
     assert (os.getpid() in {process for _, process in found}) == (processes == 1)
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_cases_are_done_on_one_thread_wherever_they_are_done(processes: int):
+    """Products of matrices are rounded by the number of threads, and chaos makes of that another result."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        assert run_cases(make_counting, (), CASES, processes) == [1] * len(CASES)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_this_process_does_its_share_and_the_others_keep_their_task():

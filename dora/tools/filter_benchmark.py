@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dora.affordance.reach.approach_paths import OK, REASONS
 from dora.errors import InputError
+from dora.parallel import one_thread
 from dora.progress import ProgressDisplay
 from dora.tasks import check_task_id, find_task, make_task, task_ids
 from dora.tasks.env.env import DoraEnv
@@ -90,6 +91,7 @@ def tabulated_ids() -> list[str]:
     return [env_id for env_id, task in alone.items() if task(task.CONFIG()).start_grid(*task.ARMS) is not None]
 
 
+@one_thread()
 def outcomes(
     env_id: str,
     episodes: int,
@@ -98,7 +100,7 @@ def outcomes(
     config: dict[str, Any] | None = None,
     act: Callable[[Tensor], Tensor] | None = None,
 ) -> Outcomes:
-    """Runs episodes without the filter.
+    """Runs episodes without the filter; on one thread, since products on more are rounded otherwise.
 
     Args:
         env_id: of a task of one arm with a table of f_reach.

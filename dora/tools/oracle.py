@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dora.errors import InputError, command
+from dora.parallel import one_thread
 from dora.progress import ProgressDisplay
 from dora.tables import share_text, text_table
 from dora.tasks import make_task
@@ -73,8 +74,9 @@ def exact_action(task: DoraEnv) -> Float[Tensor, "n a"]:
     return torch.cat(list(task.arms.exact_corrections(task.snapshot, task.perturbations).values()), -1)
 
 
+@one_thread()
 def outcome(args: Args, act: Act, error: float, report: Callable[[int, int], object]) -> Outcome:
-    """Runs the episodes.
+    """Runs the episodes; on one thread, since products on more are rounded otherwise.
 
     Args:
         args: task, preset, how many.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from dora.errors import InputError, shown
+from dora.parallel import one_thread
 from dora.sim.grasp_tests.test_scene import Physics
 from dora.tasks import find_task, make_task
 from dora.tasks.mdp.randomisation import find_preset
@@ -93,6 +94,7 @@ def measure_physics(
     return rows
 
 
+@one_thread()
 def _executed(env_id: str, physics: Physics, starts: int, preset: str, seed: int) -> PhysicsRow:
     config = {
         "physics_frequency": int(physics.rate),
