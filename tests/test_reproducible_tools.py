@@ -1,11 +1,16 @@
 """Tools that count successes find the same ones on machines with any number of cores."""
 
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+from dora.datasets import record
+from dora.datasets.episodes import Plan
+from dora.datasets.sources import find_source
 from dora.tools import filter_benchmark, oracle, physics_benchmark
 
 TOOLS: dict[str, tuple[Any, Callable[[], Any]]] = {
@@ -26,25 +31,39 @@ class ReachedError(Exception):
     """Raised where the episodes would be played."""
 
 
-@pytest.mark.parametrize("name", TOOLS)
-def test_episodes_are_played_on_one_thread(name: str, monkeypatch: pytest.MonkeyPatch):
-    """Products of matrices are rounded by the number of threads: of 200 episodes of the jug .950 succeeded on two
-    threads and .960 on one."""
-    module, run = TOOLS[name]
+def threads_of(run: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, module: Any, name: str) -> list[int]:
+    """Numbers of threads with which a function of a module is called, which then does nothing; before and after, torch
+    has three."""
     threads = []
 
     def noted(*args: Any) -> None:
         threads.append(torch.get_num_threads())
         raise ReachedError
 
-    monkeypatch.setattr(module, "play_out", noted)
-    monkeypatch.setattr(module, "BATCH", 2, raising=False)
+    monkeypatch.setattr(module, name, noted)
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
         with pytest.raises(ReachedError):
             run()
-        assert threads == [1]
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
+    return threads
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_episodes_are_played_on_one_thread(name: str, monkeypatch: pytest.MonkeyPatch):
+    """Products of matrices are rounded by the number of threads: of 200 episodes of the jug .950 succeeded on two
+    threads and .960 on one."""
+    module, run = TOOLS[name]
+    monkeypatch.setattr(module, "BATCH", 2, raising=False)
+    assert threads_of(run, monkeypatch, module, "play_out") == [1]
+
+
+def test_episodes_are_recorded_on_one_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Of a policy other starts would end in a success otherwise."""
+    source, plan = find_source("DoraCube-v1", "scripted"), Plan(episodes=1, num_envs=1)
+    run = partial(record.record_dataset, "minari", source, plan, tmp_path / "made")
+    assert threads_of(run, monkeypatch, record, "roll_out") == [1]
+    assert not (tmp_path / "made").exists()

@@ -53,7 +53,8 @@ class Plan:
         episodes: number of episodes.
         seed: of the first start; those of further ones follow.
         only_successes: leave out episodes that fail, and go on to further starts until there are enough.
-        num_envs: environments that are stepped together; the episodes do not depend on it.
+        num_envs: environments that are stepped together; the episodes do not depend on it (a policy takes care that
+            actions are rounded alike in batches of any size).
     """
 
     episodes: int

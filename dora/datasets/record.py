@@ -22,7 +22,7 @@ from dora.datasets.tables import require_pyarrow
 from dora.errors import InputError
 from dora.files import check_new_name, make_folder, write_json
 from dora.live.recordings import seal
-from dora.parallel import folder_beside
+from dora.parallel import folder_beside, one_thread
 from dora.sim.batch.rendering import can_render
 from dora.version import version_line
 
@@ -101,6 +101,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
+@one_thread()
 def record_dataset(
     kind: str,
     source: Source,
@@ -110,6 +111,8 @@ def record_dataset(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Summary:
     """Let a source act until there are as many episodes as are wanted, and write them as a dataset.
+
+    On one thread: a policy's products are rounded otherwise on more, so that other starts would end in a success.
 
     Args:
         kind: one of `FORMATS`.

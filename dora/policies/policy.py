@@ -26,6 +26,9 @@ from dora.tasks.mdp.guidance_parts import GUIDANCE, OBSERVATION, PRIOR, REGION, 
 
 BUNDLED = Path(__file__).parent / "bundled"
 """Folder of the policies that come with Dora: a checkpoint and a card for each task."""
+FEWEST_ROWS = 8
+"""Rows that are computed at least [1]: products of very few are rounded in another order, and chaos makes of that
+another episode."""
 COMPARED = ("control_frequency", "residual", "wrist_speed", "hand_speed", "reference.held_freedom")
 """Numbers of a task that say how far an action moves the hand; switches, which are true, false or a word, are compared
 as well."""
@@ -92,7 +95,9 @@ class TaskPolicy:
             self._networks.to(values.device)
             self._device = values.device
         rows = values.reshape(-1, self.observation_size).nan_to_num(0.0, 0.0, 0.0)
-        action = self._networks.greedy(rows).clamp(-1.0, 1.0).reshape(*values.shape[:-1], self.action_size)
+        enough = torch.cat([rows, rows.new_zeros(max(FEWEST_ROWS - len(rows), 0), self.observation_size)])
+        action = self._networks.greedy(enough)[: len(rows)].clamp(-1.0, 1.0)
+        action = action.reshape(*values.shape[:-1], self.action_size)
         return action if isinstance(obs, Tensor) else action.numpy(force=True)
 
     def check(self, env: gym.Env) -> None:
