@@ -47,6 +47,14 @@ def test_with_it_the_reference_leads_to_the_candidate_of_the_set(task):
         assert (away < before).all()
 
 
+def test_it_is_the_same_each_time_to_the_last_digit(task):
+    """Whatever was in memory before; an episode may turn on it."""
+    first = oracle.exact_action(task)
+    for size in range(40):
+        kept = torch.ones(size + 1)
+        assert torch.equal(oracle.exact_action(task), first), len(kept)
+
+
 def test_without_an_error_there_is_nothing_to_correct(task):
     task.anneal(error=0.0)
     task.reset(seed=[1, 2, 3, 4])

@@ -54,8 +54,7 @@ def threads_of(run: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, module: 
 
 @pytest.mark.parametrize("name", TOOLS)
 def test_episodes_are_played_on_one_thread(name: str, monkeypatch: pytest.MonkeyPatch):
-    """Products of matrices are rounded by the number of threads: of 200 episodes of the jug .950 succeeded on two
-    threads and .960 on one."""
+    """A policy's products are rounded otherwise on many threads, and chaos makes of that other episodes."""
     module, run = TOOLS[name]
     monkeypatch.setattr(module, "BATCH", 2, raising=False)
     assert threads_of(run, monkeypatch, module, "play_out") == [1]

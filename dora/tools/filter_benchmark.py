@@ -100,7 +100,7 @@ def outcomes(
     config: dict[str, Any] | None = None,
     act: Callable[[Tensor], Tensor] | None = None,
 ) -> Outcomes:
-    """Runs episodes without the filter; on one thread, since products on more are rounded otherwise.
+    """Runs episodes without the filter; on one thread, since products of `act` are rounded otherwise on many.
 
     Args:
         env_id: of a task of one arm with a table of f_reach.

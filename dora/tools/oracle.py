@@ -76,7 +76,7 @@ def exact_action(task: DoraEnv) -> Float[Tensor, "n a"]:
 
 @one_thread()
 def outcome(args: Args, act: Act, error: float, report: Callable[[int, int], object]) -> Outcome:
-    """Runs the episodes; on one thread, since products on more are rounded otherwise.
+    """Runs the episodes.
 
     Args:
         args: task, preset, how many.

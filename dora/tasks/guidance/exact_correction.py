@@ -47,5 +47,6 @@ def exact_correction(
     bend = (held.grasp[chosen] - b.grasp) / bounds.joint
     unit = torch.eye(hand_size, device=bend.device)
     effect = expand(unit) - expand(torch.zeros_like(unit))  # (action's part, joints): how a component moves the joints
-    hand = torch.linalg.lstsq(effect.T, bend.T).solution.T
+    # The last digits of a solution depend on where its numbers lie in memory: in float64 they are rounded away.
+    hand = torch.linalg.lstsq(effect.T.double(), bend.T.double()).solution.T.round(decimals=12).to(bend.dtype)
     return torch.cat([shift, turn, hand], -1).clamp(-1, 1)
